@@ -110,13 +110,18 @@ def test_tokens_of_states_turn_with_agent_and_patient_and_mirror_with_the_world(
 def test_tokens_of_masks_hold_the_largest_objects() -> None:
     ids = np.zeros((2, 8, 8), np.uint8)
     ids[:, :2, :4], ids[0, 6:, 6:], ids[:, 3:6, 0:2], ids[:, 4, 4] = 1, 2, 5, 3
+    ids[0, 3, 2] = 5  # not symmetric
     tokens = mask_tokens(ids, 3)
     columns = VIEWS["masks"].columns
     first = dict(zip(columns, tokens[0].T, strict=True))
     assert first["there"].tolist() == [1, 1, 1] and tokens[1, :, 0].tolist() == [1, 0, 1]
-    assert first["area"] == pytest.approx(np.sqrt([8 / 64, 4 / 64, 6 / 64]))
-    assert first["x"] == pytest.approx([0.25 - 0.5, 0.875 - 0.5, 0.125 - 0.5])
+    assert first["area"] == pytest.approx(np.sqrt([8 / 64, 4 / 64, 7 / 64]))
+    assert first["x"] == pytest.approx([0.25 - 0.5, 0.875 - 0.5, (6 * 1 + 2.5) / 7 / 8 - 0.5])
     assert first["bottom"] == pytest.approx([-0.25, 0.5, 0.25])
+    # Corners of a box of 4 x 2 of 8 pixels, 2 and 1 pixels from its middle.
+    for turn in (1, 2, 3, 5, 6, 7, 9, 10, 11, 13, 14, 15):
+        x, y = np.abs([np.cos(turn * np.pi / 8), np.sin(turn * np.pi / 8)])
+        assert first[f"reach {turn}"][0] == pytest.approx((2 * x + y) / 8, abs=1e-6)
     assert (tokens[1, 1, : -len(VIEWS["masks"].constants)] == 0).all()
     model: Any = build_model("intuition-masks", objects=3, weights="random")
     image = model._mirrored(torch.from_numpy(tokens)).numpy()

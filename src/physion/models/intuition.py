@@ -45,7 +45,7 @@ from physion.clips.batch import (
 )
 from physion.core.errors import BadInputError
 from physion.models.baselines.motion import F64, motions, observed_motion
-from physion.models.baselines.trees import mask_blob
+from physion.models.baselines.trees import mask_blob, mask_box
 from physion.models.checkpoint import load_named
 from physion.models.interface import (
     LearnsFrom,
@@ -60,15 +60,18 @@ from physion.numerics.rotations import rotate_vectors, rotation_matrices
 from physion.scenes.scene import Scene
 from physion.scenes.shapes.primitives import shape
 
-VERSION = 1
-
 # What a token holds. Columns of a track are of every frame, constants of the object. A mirror image
 # of a trial has the same columns in another order, some with the other sign.
 
 STATE, MASK, PIXELS = "states", "masks", "pixels"
 INPUTS = {STATE: "state", MASK: "ids", PIXELS: "rgb"}
 """What is seen, as an input of a `Spec`."""
+VERSIONS = {STATE: 1, MASK: 2, PIXELS: 2}
+"""2: tokens also hold how far masks reach in twelve directions."""
 _CORNERS = tuple(f"corner {x}{y}{z}" for x in "-+" for y in "-+" for z in "-+")
+TURNS = tuple(turn for turn in range(16) if turn % 4)
+"""Directions in a picture, in 16ths of a turn from right over down; the box has the other four."""
+_REACHES = tuple(f"reach {turn}" for turn in TURNS)
 
 
 @dataclass(frozen=True)
@@ -116,11 +119,15 @@ VIEWS: Mapping[str, TokenColumns] = {
     MASK: TokenColumns(
         track=(
             "there", "area", "x", "y", "width", "height", "slant", "left", "top", "right", "bottom",
+            *_REACHES,
         ),
         constants=("agent", "patient"),
         place=("x", "y"),
         negated=frozenset(("x", "slant", "left", "right")),
-        swapped=(("left", "right"),),
+        swapped=(
+            ("left", "right"),
+            *((f"reach {turn}", f"reach {(8 - turn) % 16}") for turn in TURNS if turn % 8 < 4),
+        ),
     ),
 }  # fmt: skip
 """Columns by what is seen; found masks have the same columns as true ones.
@@ -130,7 +137,8 @@ VIEWS: Mapping[str, TokenColumns] = {
   the shape fills, and how far it reaches into the corners of the box. The origin lies on the floor
   below the patient, the first axis points to the agent, both at the last observed frame.
 - ``masks``: square root of the area, mean, standard deviations and covariance of the pixels, and
-  the box around them, in fractions of the picture from its middle.
+  the box around them, in fractions of the picture from its middle; how far the pixels reach from
+  their mean in twelve directions, which shows corners, and with them how a body is turned.
 """
 
 
@@ -264,15 +272,41 @@ def mask_tokens(ids: NDArray[np.uint8], objects: int) -> NDArray[np.float32]:
     numbers = [AGENT_ID, PATIENT_ID, *(FIRST_OTHER_ID + int(number) for number in others)]
     tokens = np.zeros((len(ids), objects, len(view.columns)), np.float32)
     for place, number in enumerate(numbers):
-        blob = mask_blob(ids == number)
+        mask = ids == number
+        blob = mask_blob(mask)
         seen = blob[:, 0] > 0
         # Area, mean and box count from the middle of the picture.
         values = blob - np.array([0, 0.5, 0.5, 0, 0, 0, 0.5, 0.5, 0.5, 0.5], np.float32)
         values[:, 0] = np.sqrt(blob[:, 0])
+        values = np.concatenate([values, mask_reach(mask, blob[:, 1:3])], 1)
         tokens[:, place, 0] = seen
-        tokens[:, place, 1 : len(view.track)] = values * seen[:, None]
+        tokens[seen, place, 1 : len(view.track)] = values[seen]
         tokens[:, place, len(view.track) :] = (place == 0, place == 1)
     return tokens
+
+
+def mask_reach(mask: NDArray[np.bool_], mean: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return how far the pixels of masks (T, H, W) reach from their mean (T, 2), (T, 12).
+
+    In the direction a it is the largest x cos(a) + y sin(a) of the corners (x, y) of the pixels,
+    less that of the mean, in fractions of the picture; ``-inf`` where there is no pixel. `TURNS`
+    are the directions.
+    """
+    _, height, width = mask.shape
+    down, across = mask_box(mask)
+    mask = mask[:, down, across]
+    there = mask.any(axis=2)
+    # In a row the pixel on the left or the one on the right reaches farthest.
+    left = (across.start + mask.argmax(axis=2)) / width
+    right = (across.stop - mask[:, :, ::-1].argmax(axis=2)) / width
+    top = np.arange(down.start, down.stop) / height
+    out = np.empty((len(mask), len(TURNS)))
+    for column, turn in enumerate(TURNS):
+        x, y = np.cos(turn * np.pi / 8), np.sin(turn * np.pi / 8)
+        reach = x * (right if x > 0 else left) + y * (top + (y > 0) / height)
+        farthest = np.where(there, reach, -np.inf).max(axis=1)
+        out[:, column] = farthest - x * mean[:, 0] - y * mean[:, 1]
+    return out.astype(np.float32)
 
 
 # Settings.
@@ -472,17 +506,17 @@ class Intuition(TorchModel):
     def digest(self) -> str:
         """Return the SHA-256 of code version, settings and weights."""
         settings = {k: v for k, v in asdict(self.settings).items() if k not in ("weights", "seed")}
-        made = [self.name, VERSION, settings, repr(self.spec), *self._segmentation()]
+        made = [self.name, VERSIONS[self.kind], settings, repr(self.spec), *self._segmentation()]
         return weights_digest([*made, torch.__version__], self.state_dict().items())
 
     def encoder_digest(self) -> str:
         """Return the SHA-256 of what determines the tokens: no weights but of the segmentation."""
-        made = [self.kind, VERSION, self.settings.objects, repr(self.spec)]
+        made = [self.kind, VERSIONS[self.kind], self.settings.objects, repr(self.spec)]
         return weights_digest([*made, *self._segmentation()])
 
     def built_as(self) -> dict[str, Any]:
         """Return what the weights were made for: name, with the size, version, and segmentation."""
-        made: dict[str, Any] = {"model": self.name, "version": VERSION}
+        made: dict[str, Any] = {"model": self.name, "version": VERSIONS[self.kind]}
         return made | ({"segmentation": segmentation_version()} if self.kind == PIXELS else {})
 
     def encode(self, batch: Batch) -> Tensor:

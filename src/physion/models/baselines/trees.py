@@ -70,7 +70,7 @@ def mask_blob(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Return the features called `_OF_BLOB` (T, 10) of the pixels in masks (T, H, W)."""
     _, height, width = mask.shape
     # What lies outside the box around the pixels of all frames is not counted.
-    across, down = (_extent(np.asarray(mask.any(axis=axes))) for axes in ((0, 1), (0, 2)))
+    down, across = mask_box(mask)
     mask = mask[:, down, across]
     x, y = ((np.arange(side) + 0.5) / side for side in (width, height))
     x, y = x[across], y[down]
@@ -93,6 +93,12 @@ def mask_blob(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     )
     values[counts == 0] = [0, 0.5, 0.5, 0, 0, 0, 0.5, 0.5, 0.5, 0.5]
     return values.astype(np.float32)
+
+
+def mask_box(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """Return the rows and columns that hold all pixels of masks (T, H, W); the first if none do."""
+    rows, columns = (np.asarray(mask.any(axis=axes)) for axes in ((0, 2), (0, 1)))
+    return _extent(rows), _extent(columns)
 
 
 def _extent(line: NDArray[np.bool_]) -> slice:
