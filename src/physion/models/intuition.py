@@ -7,7 +7,8 @@ mask that a network finds in pictures (`intuition-pixels`, `physion.models.segme
 
     x_k = f(track_k, track_k - track_agent, track_k - track_patient, constants_k),
 
-and L blocks of attention over the objects, in no order, lead to the answer
+from masks also of the changes of the track from frame to frame, which are small next to its
+values; and L blocks of attention over the objects, in no order, lead to the answer
 
     P(contact) = sigmoid( g(x_agent, x_patient, mean_k x_k) ).
 
@@ -82,6 +83,7 @@ class TokenColumns:
     - ``place``: columns of a track that are also given relative to agent and patient.
     - ``negated``: columns with the other sign in the mirror image. ``swapped``: pairs of columns
       that change places there.
+    - ``changes``: whether a network reads the changes of a track, too; tokens do not hold them.
     """
 
     track: tuple[str, ...]
@@ -89,6 +91,7 @@ class TokenColumns:
     place: tuple[str, ...]
     negated: frozenset[str]
     swapped: tuple[tuple[str, str], ...]
+    changes: bool
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -115,6 +118,7 @@ VIEWS: Mapping[str, TokenColumns] = {
         place=("x", "y", "z"),
         negated=frozenset(("y", "axis y", "up y", "vy", "wx", "wz")),
         swapped=tuple((f"corner {x}-{z}", f"corner {x}+{z}") for x in "-+" for z in "-+"),
+        changes=False,
     ),
     MASK: TokenColumns(
         track=(
@@ -128,6 +132,7 @@ VIEWS: Mapping[str, TokenColumns] = {
             ("left", "right"),
             *((f"reach {turn}", f"reach {(8 - turn) % 16}") for turn in TURNS if turn % 8 < 4),
         ),
+        changes=True,
     ),
 }  # fmt: skip
 """Columns by what is seen; found masks have the same columns as true ones.
@@ -448,6 +453,15 @@ class TokenNetwork(nn.Module):
         return out[:, 0]
 
 
+def _changes(tokens: Tensor) -> tuple[Tensor, Tensor]:
+    """Return changes of tokens (B, T, K, D) from frame to frame (B, T - 1, K, D), and where.
+
+    They are of objects that are there in both frames (B, T - 1, K, 1).
+    """
+    there = tokens[..., :1]
+    return tokens[:, 1:] - tokens[:, :-1], there[:, 1:] * there[:, :-1]
+
+
 # The model.
 
 
@@ -472,7 +486,8 @@ class Intuition(TorchModel):
         )  # fmt: skip
         self.view = VIEWS[STATE if self.kind == STATE else MASK]
         tracked, places = len(self.view.track), len(self.view.place)
-        inputs = CONTEXT * (tracked + 2 * places) + len(self.view.constants)
+        changes = (tracked - 1) * self.view.changes
+        inputs = CONTEXT * (tracked + 2 * places + changes) + len(self.view.constants)
         with initial_weights(settings.model, settings.seed):
             self.networks = nn.ModuleList(
                 TokenNetwork(
@@ -484,6 +499,7 @@ class Intuition(TorchModel):
         self.base_rate = nn.Buffer(torch.tensor(0.5))
         self.center = nn.Buffer(torch.zeros(columns))
         self.scale = nn.Buffer(torch.ones(columns))
+        self.change = nn.Buffer(torch.ones(columns)) if self.view.changes else None
         order, signs = self.view.mirror()
         self.order = nn.Buffer(torch.tensor(order), persistent=False)
         self.signs = nn.Buffer(torch.tensor(signs), persistent=False)
@@ -581,6 +597,9 @@ class Intuition(TorchModel):
         kept = torch.tensor([name == "there" for name in self.view.columns], device=values.device)
         self.center.copy_(values.mean(0).masked_fill(kept, 0.0))
         self.scale.copy_(values.std(0).clamp(min=1e-3).masked_fill(kept, 1.0))
+        if self.change is not None:
+            changes, both = _changes(tokens)
+            self.change.copy_(changes[both[..., 0] > 0].std(0).clamp(min=1e-3))
 
     def baseline(self, batch: Batch) -> Tensor:
         """Return the cross entropy of the base rate."""
@@ -615,9 +634,7 @@ class Intuition(TorchModel):
         """Return what the network reads of tokens (B, T, K, D), and which objects are there."""
         view, steps = self.view, tokens.shape[1]
         present = tokens[..., :1]
-        scaled = ((tokens - self.center) / self.scale).clamp(-10, 10)
-        if self.training and self.settings.noise:
-            scaled = scaled + self.settings.noise * torch.randn_like(scaled)
+        scaled = self._noisy((tokens - self.center) / self.scale)
         # Presence is 0 or 1 and stays so; values of absent objects are zeros.
         scaled = torch.cat([present, scaled[..., 1:] * present], -1)
         columns = [view.columns.index(name) for name in view.place]
@@ -625,7 +642,12 @@ class Intuition(TorchModel):
         relative = [
             (places - places[:, :, who, None]) * shown * shown[:, :, who, None] for who in (0, 1)
         ]
-        tracks = torch.cat([scaled[..., : len(view.track)], *relative], -1)
+        parts = [scaled[..., : len(view.track)], *relative]
+        if self.change is not None:
+            changes, both = _changes(tokens)
+            changes = self._noisy(changes / self.change) * both
+            parts.append(functional.pad(changes, (0, 0, 0, 0, 1, 0))[..., 1 : len(view.track)])
+        tracks = torch.cat(parts, -1)
         constants = scaled[..., len(view.track) :].sum(1) / present.sum(1).clamp(min=1)
         values = tracks.transpose(1, 2).reshape(len(tokens), tokens.shape[2], -1)
         there = (present[..., 0] > 0).any(1)
@@ -633,6 +655,13 @@ class Intuition(TorchModel):
         there = there | ~there.any(1, keepdim=True)
         assert values.shape[2] == steps * tracks.shape[3]
         return torch.cat([values, constants], -1), there
+
+    def _noisy(self, values: Tensor) -> Tensor:
+        """Return values in standard deviations, at most 10, in training with noise."""
+        values = values.clamp(-10, 10)
+        if self.training and self.settings.noise:
+            values = values + self.settings.noise * torch.randn_like(values)
+        return values
 
     def _segmentation(self) -> list[str]:
         """Return what the masks depend on that are found in pictures; nothing of other models."""
