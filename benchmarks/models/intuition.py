@@ -15,7 +15,8 @@ without Drape, since simulations of cloth are slow. Five tables:
    simulation from the true state; mixtures of both, with weights fitted on own trials or, where the
    name says so, to people's answers to one half of the stimuli, and tested on the other half;
    predictions of other models (--predictions FILE); answers that have the values of another, by
-   rank; levels of noise fitted to people in the same way.
+   rank; levels of noise fitted to people in the same way; all answers together, with equal weights
+   and with weights fitted to people.
 3. What the best model could reach, from halves of the people, and the weights of mixtures.
 4. Differences of likeness beyond the outcome between learned and simulated answers, paired over
    stimuli.
@@ -381,6 +382,12 @@ def main() -> None:
         weights.append(
             f"| {given}, people | {found[:, 0].mean():.2f} | {found[:, 1:-1].sum(1).mean():.2f} |"
         )
+    together = pd.DataFrame({name: answers[name] for name in (*GIVEN.values(), *learned)})
+    together = together.join(every_level)
+    answers["mean of all learned and simulated"] = together.mean(axis=1)
+    answers["all learned and simulated, weighted to people"] = weighted_levels(
+        together, people, scenario
+    )
     mixed_own, of_own = mixed_on_own(trials, options.folder, answers, options.own, options.samples)
     answers |= mixed_own
     rows = likeness_rows(trials, answers, scored(answers))

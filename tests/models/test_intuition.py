@@ -128,6 +128,27 @@ def test_tokens_of_masks_hold_the_largest_objects() -> None:
     assert image == pytest.approx(mask_tokens(ids[:, :, ::-1], 3), abs=1e-6)
 
 
+def test_a_network_reads_changes_of_masks_that_are_there_in_both_frames() -> None:
+    ids = np.zeros((15, 16, 32), np.uint8)
+    ids[:, 10:12, 20:25] = 2
+    for frame in range(15):
+        ids[frame, 2:6, frame : frame + 4] = 1
+    ids[7, :8] = 0
+    model: Any = build_model("intuition-masks", objects=3, weights="random")
+    values, there = model._values(torch.from_numpy(mask_tokens(ids, 3))[None])
+    assert there.tolist() == [[True, True, False]]
+    track = VIEWS["masks"].track
+    read = values[0, :, : -len(VIEWS["masks"].constants)].reshape(3, 15, -1)
+    changes = dict(zip(track[1:], read[..., 1 - len(track) :].permute(2, 0, 1), strict=True))
+    expected = [0.0] + [1 / 32] * 6 + [0.0] * 2 + [1 / 32] * 6
+    for name in ("x", "left", "right"):
+        assert changes[name][0] == pytest.approx(expected), name
+    for name, change in changes.items():
+        assert (change[1:] == 0).all(), "nothing else moves"
+        if name not in ("x", "left", "right"):
+            assert change[0] == pytest.approx(0, abs=1e-6), "turned or grown"
+
+
 def clips(ids: Any, frames: Any = FRAMES) -> Batch:
     """Return a batch of pictures of objects (B, T, H, W), as tensors."""
     count, steps = ids.shape[:2]

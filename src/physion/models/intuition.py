@@ -321,8 +321,8 @@ def mask_reach(mask: NDArray[np.bool_], mean: NDArray[np.float32]) -> NDArray[np
 class IntuitionSettings(SizedSettings):
     """Settings of a model of intuition; also see `SizedSettings`.
 
-    - ``image_size``: pixels per side of the masks. From true masks by default 192, though the
-      weights that ship learned from 96; from pixels always 96.
+    - ``image_size``: pixels per side of the masks, by default 192 of true masks; from pixels always
+      96.
     - ``objects``: tokens K. With more objects the largest masks, or the bodies nearest to the line
       from agent to patient, are kept.
     - ``width``, ``layers``, ``heads``: of the network. ``dropout``: in training.
