@@ -15,8 +15,8 @@ without Drape, since simulations of cloth are slow. Five tables:
    simulation from the true state; mixtures of both, with weights fitted on own trials or, where the
    name says so, to people's answers to one half of the stimuli, and tested on the other half;
    predictions of other models (--predictions FILE); answers that have the values of another, by
-   rank; levels of noise fitted to people in the same way; all answers together, with equal weights
-   and with weights fitted to people.
+   rank; levels of noise fitted to people in the same way; forests, networks of intuition and
+   levels of noise together, with equal weights and with weights fitted to people.
 3. What the best model could reach, from halves of the people, and the weights of mixtures.
 4. Differences of likeness beyond the outcome between learned and simulated answers, paired over
    stimuli.
@@ -48,7 +48,7 @@ from intuition_controls import (
     logistic_weights,
     partial,
     slope,
-    weighted_levels,
+    weighted,
     with_spread,
 )
 from intuition_trials import load, predicted, simulated
@@ -365,9 +365,7 @@ def main() -> None:
         answers["simulation, many samples"] = many
     answers["simulation, mean of the levels"] = levels.mean(axis=1)
     answers["simulation, level fitted to people"] = best_level(every_level, people, scenario)
-    answers["simulation, levels weighted to people"] = weighted_levels(
-        every_level, people, scenario
-    )
+    answers["simulation, levels weighted to people"] = weighted(every_level, people, scenario)
     default, weights = answers[str(levels.columns[0])], []
     learned = [name for name in given_answers if name.startswith("intuition")]
     for given in (*GIVEN.values(), *learned):
@@ -384,8 +382,8 @@ def main() -> None:
         )
     together = pd.DataFrame({name: answers[name] for name in (*GIVEN.values(), *learned)})
     together = together.join(every_level)
-    answers["mean of all learned and simulated"] = together.mean(axis=1)
-    answers["all learned and simulated, weighted to people"] = weighted_levels(
+    answers["mean of forests, networks and simulations"] = together.mean(axis=1)
+    answers["forests, networks and simulations, weighted to people"] = weighted(
         together, people, scenario
     )
     mixed_own, of_own = mixed_on_own(trials, options.folder, answers, options.own, options.samples)

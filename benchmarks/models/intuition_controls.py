@@ -177,11 +177,11 @@ def best_level(levels: pd.DataFrame, people: pd.DataFrame, scenario: pd.Series) 
     return out
 
 
-def weighted_levels(levels: pd.DataFrame, people: pd.DataFrame, scenario: pd.Series) -> pd.Series:
-    """Return a sum of levels, a constant and weights above 0, fitted on the other stimuli."""
-    first, out = halves(scenario), pd.Series(np.nan, levels.index)
-    design = np.column_stack([levels.to_numpy(), np.ones(len(levels))])
-    fraction = (people["yes"] / people["count"])[levels.index].to_numpy()
+def weighted(answers: pd.DataFrame, people: pd.DataFrame, scenario: pd.Series) -> pd.Series:
+    """Return a sum of answers, a constant and weights above 0, fitted on the other stimuli."""
+    first, out = halves(scenario), pd.Series(np.nan, answers.index)
+    design = np.column_stack([answers.to_numpy(), np.ones(len(answers))])
+    fraction = (people["yes"] / people["count"])[answers.index].to_numpy()
     for half in (first, ~first):
         weights, _ = nnls(design[half], fraction[half])
         out[~half] = design[~half] @ weights

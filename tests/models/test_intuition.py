@@ -110,7 +110,7 @@ def test_tokens_of_states_turn_with_agent_and_patient_and_mirror_with_the_world(
 def test_tokens_of_masks_hold_the_largest_objects() -> None:
     ids = np.zeros((2, 8, 8), np.uint8)
     ids[:, :2, :4], ids[0, 6:, 6:], ids[:, 3:6, 0:2], ids[:, 4, 4] = 1, 2, 5, 3
-    ids[0, 3, 2] = 5  # not symmetric
+    ids[0, 3, 2] = 5  # so that up and down, left and right differ
     tokens = mask_tokens(ids, 3)
     columns = VIEWS["masks"].columns
     first = dict(zip(columns, tokens[0].T, strict=True))
@@ -122,6 +122,10 @@ def test_tokens_of_masks_hold_the_largest_objects() -> None:
     for turn in (1, 2, 3, 5, 6, 7, 9, 10, 11, 13, 14, 15):
         x, y = np.abs([np.cos(turn * np.pi / 8), np.sin(turn * np.pi / 8)])
         assert first[f"reach {turn}"][0] == pytest.approx((2 * x + y) / 8, abs=1e-6)
+    # The other object, of mean (8.5, 30.5) / 7 pixels, reaches to the corners (3, 3), (0, 3), (0, 6).
+    x, y = 8.5 / 7, 30.5 / 7
+    for turn, (dx, dy) in {14: (3 - x, y - 3), 10: (x, y - 3), 6: (x, 6 - y)}.items():
+        assert first[f"reach {turn}"][2] == pytest.approx((dx + dy) / 8 / np.sqrt(2), abs=1e-6)
     assert (tokens[1, 1, : -len(VIEWS["masks"].constants)] == 0).all()
     model: Any = build_model("intuition-masks", objects=3, weights="random")
     image = model._mirrored(torch.from_numpy(tokens)).numpy()
@@ -147,6 +151,15 @@ def test_a_network_reads_changes_of_masks_that_are_there_in_both_frames() -> Non
         assert (change[1:] == 0).all(), "nothing else moves"
         if name not in ("x", "left", "right"):
             assert change[0] == pytest.approx(0, abs=1e-6), "turned or grown"
+    # In training they have noise, and their own standard deviation.
+    sample = MovingSquares(model.spec).context([f"drop_{number:04d}" for number in range(150)])
+    model = build_model("intuition-masks", image_size=16, objects=3, weights="random").train()
+    model.prepare(replace(sample, contact=torch.tensor([True, False] * 75)))
+    tokens = model._tokens(sample)
+    read = model._values(tokens)[0][..., : -len(VIEWS["masks"].constants)].reshape(150, 3, 15, -1)
+    moved = read[:, 0, 1:, 1 - len(track) + track.index("x") - 1]
+    assert float(moved.std()) == pytest.approx(1, rel=0.5) and len(torch.unique(moved)) > 2000
+    assert (read[:, :, 0, 1 - len(track) :] == 0).all(), "no noise where nothing is before"
 
 
 def clips(ids: Any, frames: Any = FRAMES) -> Batch:
@@ -294,7 +307,7 @@ def test_tokens_of_masks_say_the_same_at_any_size() -> None:
         with torch.no_grad():
             answers.append(float(shipped.predict(replace(batch, features=tokens))))
     both = (found[0][..., :1] > 0) & (found[1][..., :1] > 0)
-    # Places, sizes and borders differ by less than a pixel of the coarser picture.
+    # Places, sizes, borders and reaches differ by less than a pixel of the coarser picture.
     assert 0 < ((found[0] - found[1]).abs() * both).max() < 1 / 96
     assert answers[0] != answers[1] and abs(answers[0] - answers[1]) < 0.05
     with pytest.raises(BadInputError, match="are for image_size=192, not 96"):

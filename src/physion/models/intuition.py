@@ -5,12 +5,15 @@ and how they ended. An object is a token, which holds its track over the observe
 44, from the true state (`intuition-states`), from its true mask (`intuition-masks`), or from the
 mask that a network finds in pictures (`intuition-pixels`, `physion.models.segmentation`):
 
-    x_k = f(track_k, track_k - track_agent, track_k - track_patient, constants_k),
+    x_k = f(track_k, track_k - track_agent, track_k - track_patient, d track_k, constants_k),
 
-from masks also of the changes of the track from frame to frame, which are small next to its
-values; and L blocks of attention over the objects, in no order, lead to the answer
+and L blocks of attention over the objects, in no order, lead to the answer
 
     P(contact) = sigmoid( g(x_agent, x_patient, mean_k x_k) ).
+
+Changes d track_k(t) = track_k(t) - track_k(t - 1) are read of masks only: states hold velocities.
+They are 0 in the first frame and where the object is missing in one of both. Next to the values
+they are small, so f reads them in their own standard deviations.
 
 The loss is the cross entropy of the outcomes. Which object is agent, patient or probe is one of its
 constants. In training a trial is mirrored at random; an answer is the mean of both images, and of
@@ -68,7 +71,9 @@ STATE, MASK, PIXELS = "states", "masks", "pixels"
 INPUTS = {STATE: "state", MASK: "ids", PIXELS: "rgb"}
 """What is seen, as an input of a `Spec`."""
 VERSIONS = {STATE: 1, MASK: 2, PIXELS: 2}
-"""2: tokens also hold how far masks reach in twelve directions."""
+"""Version of tokens and network by what is seen.
+
+2: tokens hold how far masks reach in twelve directions, and the network reads changes."""
 _CORNERS = tuple(f"corner {x}{y}{z}" for x in "-+" for y in "-+" for z in "-+")
 TURNS = tuple(turn for turn in range(16) if turn % 4)
 """Directions in a picture, in 16ths of a turn from right over down; the box has the other four."""
@@ -142,8 +147,8 @@ VIEWS: Mapping[str, TokenColumns] = {
   the shape fills, and how far it reaches into the corners of the box. The origin lies on the floor
   below the patient, the first axis points to the agent, both at the last observed frame.
 - ``masks``: square root of the area, mean, standard deviations and covariance of the pixels, and
-  the box around them, in fractions of the picture from its middle; how far the pixels reach from
-  their mean in twelve directions, which shows corners, and with them how a body is turned.
+  the box around them from the middle of the picture, and how far the pixels reach from their mean
+  in twelve directions, in fractions of the picture. Reaches tell how a body is turned.
 """
 
 
@@ -291,11 +296,12 @@ def mask_tokens(ids: NDArray[np.uint8], objects: int) -> NDArray[np.float32]:
 
 
 def mask_reach(mask: NDArray[np.bool_], mean: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return how far the pixels of masks (T, H, W) reach from their mean (T, 2), (T, 12).
+    """Return how far masks (T, H, W) reach from the means (T, 2) of their pixels, as (T, 12).
 
-    In the direction a it is the largest x cos(a) + y sin(a) of the corners (x, y) of the pixels,
-    less that of the mean, in fractions of the picture; ``-inf`` where there is no pixel. `TURNS`
-    are the directions.
+        reach(a) = max over corners (x, y) of pixels of (x - mean_x) cos(a) + (y - mean_y) sin(a)
+
+    for the directions a of `TURNS`; x counts to the right in widths of the picture, y downwards in
+    heights. It is ``-inf`` where there is no pixel.
     """
     _, height, width = mask.shape
     down, across = mask_box(mask)
@@ -321,13 +327,13 @@ def mask_reach(mask: NDArray[np.bool_], mean: NDArray[np.float32]) -> NDArray[np
 class IntuitionSettings(SizedSettings):
     """Settings of a model of intuition; also see `SizedSettings`.
 
-    - ``image_size``: pixels per side of the masks, by default 192 of true masks; from pixels always
-      96.
+    - ``image_size``: pixels per side of the masks: 192 by default for true masks, always 96 from
+      pixels.
     - ``objects``: tokens K. With more objects the largest masks, or the bodies nearest to the line
       from agent to patient, are kept.
     - ``width``, ``layers``, ``heads``: of the network. ``dropout``: in training.
-    - ``noise``: standard deviation of noise on the values of tokens in training, in standard
-      deviations of a value.
+    - ``noise``: standard deviation of noise on values of tokens and, independently, on their
+      changes in training, in standard deviations of each.
     - ``members``: networks, trained at the same time, whose probabilities are averaged.
     - ``cue``: from pixels only: objects may have any colours, and the masks of the first frame of
       the clip show which are agent and patient, as a cue showed people. Other masks are not looked
@@ -453,13 +459,14 @@ class TokenNetwork(nn.Module):
         return out[:, 0]
 
 
-def _changes(tokens: Tensor) -> tuple[Tensor, Tensor]:
-    """Return changes of tokens (B, T, K, D) from frame to frame (B, T - 1, K, D), and where.
+def _changes(track: Tensor) -> tuple[Tensor, Tensor]:
+    """Return a track (B, T, K, D) less the frame before (B, T - 1, K, D - 1), and whether it is.
 
-    They are of objects that are there in both frames (B, T - 1, K, 1).
+    The object has to be there in both frames: 1 or 0 (B, T - 1, K, 1). The first column, which says
+    so, is left out.
     """
-    there = tokens[..., :1]
-    return tokens[:, 1:] - tokens[:, :-1], there[:, 1:] * there[:, :-1]
+    there, values = track[..., :1], track[..., 1:]
+    return values[:, 1:] - values[:, :-1], there[:, 1:] * there[:, :-1]
 
 
 # The model.
@@ -486,8 +493,8 @@ class Intuition(TorchModel):
         )  # fmt: skip
         self.view = VIEWS[STATE if self.kind == STATE else MASK]
         tracked, places = len(self.view.track), len(self.view.place)
-        changes = (tracked - 1) * self.view.changes
-        inputs = CONTEXT * (tracked + 2 * places + changes) + len(self.view.constants)
+        changing = tracked - 1 if self.view.changes else 0
+        inputs = CONTEXT * (tracked + 2 * places + changing) + len(self.view.constants)
         with initial_weights(settings.model, settings.seed):
             self.networks = nn.ModuleList(
                 TokenNetwork(
@@ -499,7 +506,7 @@ class Intuition(TorchModel):
         self.base_rate = nn.Buffer(torch.tensor(0.5))
         self.center = nn.Buffer(torch.zeros(columns))
         self.scale = nn.Buffer(torch.ones(columns))
-        self.change = nn.Buffer(torch.ones(columns)) if self.view.changes else None
+        self.change_scale = nn.Buffer(torch.ones(changing)) if changing else None
         order, signs = self.view.mirror()
         self.order = nn.Buffer(torch.tensor(order), persistent=False)
         self.signs = nn.Buffer(torch.tensor(signs), persistent=False)
@@ -597,9 +604,9 @@ class Intuition(TorchModel):
         kept = torch.tensor([name == "there" for name in self.view.columns], device=values.device)
         self.center.copy_(values.mean(0).masked_fill(kept, 0.0))
         self.scale.copy_(values.std(0).clamp(min=1e-3).masked_fill(kept, 1.0))
-        if self.change is not None:
-            changes, both = _changes(tokens)
-            self.change.copy_(changes[both[..., 0] > 0].std(0).clamp(min=1e-3))
+        if self.change_scale is not None:
+            changes, both = _changes(tokens[..., : len(self.view.track)])
+            self.change_scale.copy_(changes[both[..., 0] > 0].std(0).clamp(min=1e-3))
 
     def baseline(self, batch: Batch) -> Tensor:
         """Return the cross entropy of the base rate."""
@@ -643,10 +650,11 @@ class Intuition(TorchModel):
             (places - places[:, :, who, None]) * shown * shown[:, :, who, None] for who in (0, 1)
         ]
         parts = [scaled[..., : len(view.track)], *relative]
-        if self.change is not None:
-            changes, both = _changes(tokens)
-            changes = self._noisy(changes / self.change) * both
-            parts.append(functional.pad(changes, (0, 0, 0, 0, 1, 0))[..., 1 : len(view.track)])
+        if self.change_scale is not None:
+            changes, both = _changes(tokens[..., : len(view.track)])
+            changes = self._noisy(changes / self.change_scale) * both
+            # Nothing is before the first frame: no change.
+            parts.append(functional.pad(changes, (0, 0, 0, 0, 1, 0)))
         tracks = torch.cat(parts, -1)
         constants = scaled[..., len(view.track) :].sum(1) / present.sum(1).clamp(min=1)
         values = tracks.transpose(1, 2).reshape(len(tokens), tokens.shape[2], -1)
@@ -657,7 +665,7 @@ class Intuition(TorchModel):
         return torch.cat([values, constants], -1), there
 
     def _noisy(self, values: Tensor) -> Tensor:
-        """Return values in standard deviations, at most 10, in training with noise."""
+        """Return values, in standard deviations, cut to -10 to 10; in training noise is added."""
         values = values.clamp(-10, 10)
         if self.training and self.settings.noise:
             values = values + self.settings.noise * torch.randn_like(values)
