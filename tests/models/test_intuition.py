@@ -122,7 +122,7 @@ def test_tokens_of_masks_hold_the_largest_objects() -> None:
     for turn in (1, 2, 3, 5, 6, 7, 9, 10, 11, 13, 14, 15):
         x, y = np.abs([np.cos(turn * np.pi / 8), np.sin(turn * np.pi / 8)])
         assert first[f"reach {turn}"][0] == pytest.approx((2 * x + y) / 8, abs=1e-6)
-    # The other object, of mean (8.5, 30.5) / 7 pixels, reaches to the corners (3, 3), (0, 3), (0, 6).
+    # The other object, of mean (8.5, 30.5) / 7, reaches to the corners (3, 3), (0, 3), (0, 6).
     x, y = 8.5 / 7, 30.5 / 7
     for turn, (dx, dy) in {14: (3 - x, y - 3), 10: (x, y - 3), 6: (x, 6 - y)}.items():
         assert first[f"reach {turn}"][2] == pytest.approx((dx + dy) / 8 / np.sqrt(2), abs=1e-6)
