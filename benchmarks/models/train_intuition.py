@@ -6,15 +6,15 @@
 The trainer is the one of `physion train`; the same command resumes. The last tenth of the own
 trials of every scenario trains nothing: on them, and on the official stimuli without a contact in
 the observed part, networks are tested, and compared with forests that saw the same training trials,
-where their features are stored. With --start a training begins from other weights, that of pixels
-from those of masks; with --steps 0, too, nothing is trained, and these weights are tested on all
-own trials. Predictions of official stimuli go to FOLDER/predictions, where ``intuition.py
---predictions`` reads them, weights to FOLDER/training. --weights names a folder for the weights of
-all scenarios as float16. Other trainings answer what a network has to have seen: --counts, the
-first trials of each scenario only; --unseen, without the configuration of the tested trial
-(`FOLDS` trainings, each without a part of the configurations); --all-but, without its scenario.
-With --write the table is written to ``results/intuition_networks.md``, with these trainings to
-``results/MODEL_unseen.md``, of one model at a time.
+where their features are stored. With --start a training begins from other weights;
+with --steps 0, too, nothing is trained, and these weights are tested on all own trials. Predictions
+of official stimuli go to FOLDER/predictions, where ``intuition.py --predictions`` reads them,
+weights to FOLDER/training. --weights names a folder for the weights of all scenarios as float16.
+Other trainings answer what a network has to have seen: --counts, the first trials of each scenario
+only; --unseen, without the configuration of the tested trial (`FOLDS` trainings, each without a
+part of the configurations); --all-but, without its scenario. With --write the table is written to
+``results/intuition_networks.md``, with these trainings to ``results/MODEL_unseen.md``, of one model
+at a time.
 """
 
 from __future__ import annotations
@@ -54,8 +54,6 @@ SAME = {
     "intuition-pixels": "blob-trees",
 }  # fmt: skip
 """Forests that see as much as a network."""
-SAME_TOKENS = {"intuition-pixels": "intuition-masks"}
-"""Models that may begin from the weights of another one, whose tokens have the same columns."""
 TOGETHER = 64
 """Trials that are predicted at a time."""
 
@@ -109,9 +107,8 @@ class Learner:
         """
         model: Any = build_untrained(self.name, **self._options())
         if self.options.start:
-            same = self.name if self.options.steps == 0 else SAME_TOKENS.get(self.name, self.name)
-            weights = str(self.options.start / f"{same}-small.safetensors")
-            other: Any = build_untrained(same, **self._options(), weights=weights)
+            weights = str(self.options.start / f"{self.name}-small.safetensors")
+            other: Any = build_untrained(self.name, **self._options(), weights=weights)
             model.load_state_dict(other.state_dict())
             model.trained, model.init = True, other.init
         self.title = model.name

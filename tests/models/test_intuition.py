@@ -281,11 +281,14 @@ def test_pixels_become_the_tokens_of_the_masks_that_are_found() -> None:
     true: Any = build_model("intuition-masks", image_size=96, weights="random")
     batch = pictures(drawn["rgb"][None], ["new"])
     tokens = model.encode(batch)
-    assert np.array_equal(tokens[0].reshape(15, 8, -1), mask_tokens(segment(drawn["rgb"]), 8))
+    assert np.array_equal(
+        tokens[0].reshape(15, 8, -1), mask_tokens(segment(drawn["rgb"]), 8, VIEWS["pixels"])
+    )
     expected = true.encode(clips(drawn["ids"][None]))[0].reshape(15, 8, -1)
     found = tokens[0].reshape(15, 8, -1)
     # Agent and patient: there, area, x, y and the others, in fractions of the picture.
-    assert (found[:, :2] - expected[:, :2]).abs().mean() < 0.01
+    alike = len(VIEWS["pixels"].track)
+    assert (found[:, :2, :alike] - expected[:, :2, :alike]).abs().mean() < 0.01
     with torch.no_grad():
         assert torch.equal(model.predict(batch), model.predict(replace(batch, features=tokens)))
     assert model.notes(batch) == [""]
@@ -309,7 +312,7 @@ def test_tokens_of_masks_say_the_same_at_any_size() -> None:
     both = (found[0][..., :1] > 0) & (found[1][..., :1] > 0)
     # Places, sizes, borders and reaches differ by less than a pixel of the coarser picture.
     assert 0 < ((found[0] - found[1]).abs() * both).max() < 1 / 96
-    assert answers[0] != answers[1] and abs(answers[0] - answers[1]) < 0.05
+    assert answers[0] != answers[1] and abs(answers[0] - answers[1]) < 0.1
     with pytest.raises(BadInputError, match="are for image_size=192, not 96"):
         build_model("intuition-masks", image_size=96)
 
@@ -324,7 +327,8 @@ def test_with_a_cue_only_the_masks_of_the_first_frame_count() -> None:
     batch = replace(pictures(drawn["rgb"][None], ["new"]), ids=drawn["ids"][None])
     tokens = model.encode(batch)
     assert np.array_equal(
-        tokens[0].reshape(15, 8, -1), mask_tokens(segment(drawn["rgb"], drawn["ids"][0]), 8)
+        tokens[0].reshape(15, 8, -1),
+        mask_tokens(segment(drawn["rgb"], drawn["ids"][0]), 8, VIEWS["pixels"]),
     )
     later = drawn["ids"].copy()
     later[1:] = 0

@@ -11,9 +11,9 @@ and L blocks of attention over the objects, in no order, lead to the answer
 
     P(contact) = sigmoid( g(x_agent, x_patient, mean_k x_k) ).
 
-Changes d track_k(t) = track_k(t) - track_k(t - 1) are read of masks only: states hold velocities.
-They are 0 in the first frame and where the object is missing in one of both. Next to the values
-they are small, so f reads them in their own standard deviations.
+Changes d track_k(t) = track_k(t) - track_k(t - 1) are read of true masks only: states hold
+velocities, and found masks flicker. They are 0 in the first frame and where the object is missing
+in one of both. Next to the values they are small, so f reads them in their own standard deviations.
 
 The loss is the cross entropy of the outcomes. Which object is agent, patient or probe is one of its
 constants. In training a trial is mirrored at random; an answer is the mean of both images, and of
@@ -70,14 +70,17 @@ from physion.scenes.shapes.primitives import shape
 STATE, MASK, PIXELS = "states", "masks", "pixels"
 INPUTS = {STATE: "state", MASK: "ids", PIXELS: "rgb"}
 """What is seen, as an input of a `Spec`."""
-VERSIONS = {STATE: 1, MASK: 2, PIXELS: 2}
+VERSIONS = {STATE: 1, MASK: 2, PIXELS: 1}
 """Version of tokens and network by what is seen.
 
-2: tokens hold how far masks reach in twelve directions, and the network reads changes."""
+2 of masks: tokens hold how far they reach in twelve directions, and the network reads changes."""
 _CORNERS = tuple(f"corner {x}{y}{z}" for x in "-+" for y in "-+" for z in "-+")
 TURNS = tuple(turn for turn in range(16) if turn % 4)
 """Directions in a picture, in 16ths of a turn from right over down; the box has the other four."""
 _REACHES = tuple(f"reach {turn}" for turn in TURNS)
+_OF_MASK = (
+    "there", "area", "x", "y", "width", "height", "slant", "left", "top", "right", "bottom",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -126,10 +129,7 @@ VIEWS: Mapping[str, TokenColumns] = {
         changes=False,
     ),
     MASK: TokenColumns(
-        track=(
-            "there", "area", "x", "y", "width", "height", "slant", "left", "top", "right", "bottom",
-            *_REACHES,
-        ),
+        track=(*_OF_MASK, *_REACHES),
         constants=("agent", "patient"),
         place=("x", "y"),
         negated=frozenset(("x", "slant", "left", "right")),
@@ -139,8 +139,16 @@ VIEWS: Mapping[str, TokenColumns] = {
         ),
         changes=True,
     ),
+    PIXELS: TokenColumns(
+        track=_OF_MASK,
+        constants=("agent", "patient"),
+        place=("x", "y"),
+        negated=frozenset(("x", "slant", "left", "right")),
+        swapped=(("left", "right"),),
+        changes=False,
+    ),
 }  # fmt: skip
-"""Columns by what is seen; found masks have the same columns as true ones.
+"""Columns by what is seen.
 
 - ``states``: centre of the bounding box in metres, directions of two axes of the body, velocity
   and angular velocity (asinh of m/s and rad/s); size in metres, fraction of the bounding box that
@@ -149,6 +157,7 @@ VIEWS: Mapping[str, TokenColumns] = {
 - ``masks``: square root of the area, mean, standard deviations and covariance of the pixels, and
   the box around them from the middle of the picture, and how far the pixels reach from their mean
   in twelve directions, in fractions of the picture. Reaches tell how a body is turned.
+- ``pixels``: the same of masks that are found, without reaches and changes: their borders flicker.
 """
 
 
@@ -271,12 +280,14 @@ def _reach(name: str) -> tuple[float, ...]:
 # Tokens of masks.
 
 
-def mask_tokens(ids: NDArray[np.uint8], objects: int) -> NDArray[np.float32]:
+def mask_tokens(
+    ids: NDArray[np.uint8], objects: int, view: TokenColumns = VIEWS[MASK]
+) -> NDArray[np.float32]:
     """Return the tokens (T, K, D) of a clip from the objects of its pixels (T, H, W).
 
     The first two are agent and patient, then come the others with the most pixels in all frames.
+    ``view`` is that of true or of found masks.
     """
-    view = VIEWS[MASK]
     pixels = np.bincount(ids.ravel(), minlength=256)[FIRST_OTHER_ID:]
     others = [n for n in np.argsort(-pixels, kind="stable")[: objects - 2] if pixels[n] > 0]
     numbers = [AGENT_ID, PATIENT_ID, *(FIRST_OTHER_ID + int(number) for number in others)]
@@ -288,7 +299,8 @@ def mask_tokens(ids: NDArray[np.uint8], objects: int) -> NDArray[np.float32]:
         # Area, mean and box count from the middle of the picture.
         values = blob - np.array([0, 0.5, 0.5, 0, 0, 0, 0.5, 0.5, 0.5, 0.5], np.float32)
         values[:, 0] = np.sqrt(blob[:, 0])
-        values = np.concatenate([values, mask_reach(mask, blob[:, 1:3])], 1)
+        if view is VIEWS[MASK]:
+            values = np.concatenate([values, mask_reach(mask, blob[:, 1:3])], 1)
         tokens[:, place, 0] = seen
         tokens[seen, place, 1 : len(view.track)] = values[seen]
         tokens[:, place, len(view.track) :] = (place == 0, place == 1)
@@ -358,13 +370,12 @@ class IntuitionSettings(SizedSettings):
     def defaults(cls, model: str, options: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return the settings of a model.
 
-        States have more tokens, true masks more pixels. Masks are trained with more noise and
+        States have more tokens. True masks have more pixels, and are trained with more noise and
         dropout, with which the loss of held-out trials was smaller.
         """
-        own: dict[str, Any] = {"objects": 12}
-        if model != "intuition-states":
-            size = 192 if model == "intuition-masks" else SIDE
-            own = {"objects": 8, "image_size": size, "dropout": 0.2, "noise": 0.05}
+        own: dict[str, Any] = {"objects": 12 if model == "intuition-states" else 8}
+        if model == "intuition-masks":
+            own |= {"image_size": 192, "dropout": 0.2, "noise": 0.05}
         return {**own, **super().defaults(model, options)}
 
     def __post_init__(self) -> None:
@@ -495,7 +506,7 @@ class Intuition(TorchModel):
             inputs=(INPUTS[self.kind], *("ids",) * settings.cue), image_size=settings.image_size,
             stride=STRIDE, context=CONTEXT, future=0, framewise=False,
         )  # fmt: skip
-        self.view = VIEWS[STATE if self.kind == STATE else MASK]
+        self.view = VIEWS[self.kind]
         tracked, places = len(self.view.track), len(self.view.place)
         changing = tracked - 1 if self.view.changes else 0
         inputs = CONTEXT * (tracked + 2 * places + changing) + len(self.view.constants)
@@ -555,7 +566,7 @@ class Intuition(TorchModel):
             rows = zip(motions(batch, self.name), batch.trials, shown, strict=True)
             tokens = [state_tokens(motion, trial, of, objects) for motion, trial, of in rows]
         else:
-            tokens = [mask_tokens(ids, objects) for ids in self._ids(batch)]
+            tokens = [mask_tokens(ids, objects, self.view) for ids in self._ids(batch)]
         return torch.from_numpy(np.stack(tokens)).flatten(2).to(self.device)
 
     def predict(self, batch: Batch) -> Tensor:
@@ -578,7 +589,7 @@ class Intuition(TorchModel):
         if self.settings.cue:
             unseen = "agent or patient not visible in the first frame"
         if ids is not None:
-            tokens = np.stack([mask_tokens(one, most) for one in ids])
+            tokens = np.stack([mask_tokens(one, most, self.view) for one in ids])
             batch = replace(batch, features=torch.from_numpy(tokens).flatten(2).to(self.device))
         for seen, count in zip(self.seen(batch).tolist(), self._counts(batch, ids), strict=True):
             hidden = "" if seen else f"{unseen}: base rate"
