@@ -286,7 +286,7 @@ def mask_tokens(
     """Return the tokens (T, K, D) of a clip from the objects of its pixels (T, H, W).
 
     The first two are agent and patient, then come the others with the most pixels in all frames.
-    ``view`` is that of true or of found masks.
+    ``view`` has the columns.
     """
     pixels = np.bincount(ids.ravel(), minlength=256)[FIRST_OTHER_ID:]
     others = [n for n in np.argsort(-pixels, kind="stable")[: objects - 2] if pixels[n] > 0]
