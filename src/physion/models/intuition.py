@@ -501,6 +501,8 @@ class Intuition(TorchModel):
         settings.check_shipped()
         self.name = f"{settings.model}-{settings.size}"
         self.kind = settings.model.partition("-")[2]
+        if self.kind == MASK:
+            self.training_settings = replace(TRAINING, steps=3000)
         self.settings, self.seed, self.window = settings, settings.seed, CONTEXT
         self.spec = Spec(
             inputs=(INPUTS[self.kind], *("ids",) * settings.cue), image_size=settings.image_size,
