@@ -6,10 +6,10 @@
 The trainer is the one of `physion train`; the same command resumes. The last tenth of the own
 trials of every scenario trains nothing: on them, and on the official stimuli without a contact in
 the observed part, networks are tested, and compared with forests that saw the same training trials,
-where their features are stored. With --start a training begins from other weights;
-with --steps 0, too, nothing is trained, and these weights are tested on all own trials. Predictions
-of official stimuli go to FOLDER/predictions, where ``intuition.py --predictions`` reads them,
-weights to FOLDER/training. --weights names a folder for the weights of all scenarios as float16.
+where their features are stored. With --start a training begins from other weights; with --steps 0,
+too, nothing is trained, and these weights are tested on all own trials. Predictions of official
+stimuli go to FOLDER/predictions, where ``intuition.py --predictions`` reads them, weights to
+FOLDER/training. --weights names a folder for the weights of all scenarios as float16.
 Other trainings answer what a network has to have seen: --counts, the first trials of each scenario
 only; --unseen, without the configuration of the tested trial (`FOLDS` trainings, each without a
 part of the configurations); --all-but, without its scenario. With --write the table is written to
