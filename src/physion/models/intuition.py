@@ -78,9 +78,6 @@ _CORNERS = tuple(f"corner {x}{y}{z}" for x in "-+" for y in "-+" for z in "-+")
 TURNS = tuple(turn for turn in range(16) if turn % 4)
 """Directions in a picture, in 16ths of a turn from right over down; the box has the other four."""
 _REACHES = tuple(f"reach {turn}" for turn in TURNS)
-_OF_MASK = (
-    "there", "area", "x", "y", "width", "height", "slant", "left", "top", "right", "bottom",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -113,6 +110,16 @@ class TokenColumns:
         return order, [-1.0 if name in self.negated else 1.0 for name in self.columns]
 
 
+_FOUND = TokenColumns(
+    track=(
+        "there", "area", "x", "y", "width", "height", "slant", "left", "top", "right", "bottom",
+    ),
+    constants=("agent", "patient"),
+    place=("x", "y"),
+    negated=frozenset(("x", "slant", "left", "right")),
+    swapped=(("left", "right"),),
+    changes=False,
+)  # fmt: skip
 VIEWS: Mapping[str, TokenColumns] = {
     STATE: TokenColumns(
         track=(
@@ -128,25 +135,16 @@ VIEWS: Mapping[str, TokenColumns] = {
         swapped=tuple((f"corner {x}-{z}", f"corner {x}+{z}") for x in "-+" for z in "-+"),
         changes=False,
     ),
-    MASK: TokenColumns(
-        track=(*_OF_MASK, *_REACHES),
-        constants=("agent", "patient"),
-        place=("x", "y"),
-        negated=frozenset(("x", "slant", "left", "right")),
+    MASK: replace(
+        _FOUND,
+        track=(*_FOUND.track, *_REACHES),
         swapped=(
-            ("left", "right"),
+            *_FOUND.swapped,
             *((f"reach {turn}", f"reach {(8 - turn) % 16}") for turn in TURNS if turn % 8 < 4),
         ),
         changes=True,
     ),
-    PIXELS: TokenColumns(
-        track=_OF_MASK,
-        constants=("agent", "patient"),
-        place=("x", "y"),
-        negated=frozenset(("x", "slant", "left", "right")),
-        swapped=(("left", "right"),),
-        changes=False,
-    ),
+    PIXELS: _FOUND,
 }  # fmt: skip
 """Columns by what is seen.
 
@@ -286,7 +284,7 @@ def mask_tokens(
     """Return the tokens (T, K, D) of a clip from the objects of its pixels (T, H, W).
 
     The first two are agent and patient, then come the others with the most pixels in all frames.
-    ``view`` has the columns.
+    ``view`` says which columns D they have.
     """
     pixels = np.bincount(ids.ravel(), minlength=256)[FIRST_OTHER_ID:]
     others = [n for n in np.argsort(-pixels, kind="stable")[: objects - 2] if pixels[n] > 0]
@@ -299,7 +297,7 @@ def mask_tokens(
         # Area, mean and box count from the middle of the picture.
         values = blob - np.array([0, 0.5, 0.5, 0, 0, 0, 0.5, 0.5, 0.5, 0.5], np.float32)
         values[:, 0] = np.sqrt(blob[:, 0])
-        if view is VIEWS[MASK]:
+        if view.track[-1] in _REACHES:
             values = np.concatenate([values, mask_reach(mask, blob[:, 1:3])], 1)
         tokens[:, place, 0] = seen
         tokens[seen, place, 1 : len(view.track)] = values[seen]
@@ -475,10 +473,10 @@ class TokenNetwork(nn.Module):
 
 
 def _changes(track: Tensor) -> tuple[Tensor, Tensor]:
-    """Return a track (B, T, K, D) less the frame before (B, T - 1, K, D - 1), and whether it is.
+    """Return the changes of a track (B, T, K, D) since the frame before (B, T - 1, K, D - 1).
 
-    The object has to be there in both frames: 1 or 0 (B, T - 1, K, 1). The first column, which says
-    so, is left out.
+    Also returned is whether the object is there in both frames, 1 or 0 (B, T - 1, K, 1). That is
+    what the first column of a track says, which has no changes.
     """
     there, values = track[..., :1], track[..., 1:]
     return values[:, 1:] - values[:, :-1], there[:, 1:] * there[:, :-1]
