@@ -5,11 +5,12 @@
 
 The trainer is the one of `physion train`; the same command resumes. The last tenth of the own
 trials of every scenario trains nothing: on them, and on the official stimuli without a contact in
-the observed part, networks are tested, and compared with forests that saw the same training trials,
-where their features are stored. With --start a training begins from other weights; with --steps 0,
-too, nothing is trained, and these weights are tested on all own trials. Predictions of official
-stimuli go to FOLDER/predictions, where ``intuition.py --predictions`` reads them, weights to
-FOLDER/training. --weights names a folder for the weights of all scenarios as float16.
+the observed part, models are tested, also each of their networks alone, and compared with forests
+that saw the same training trials, where their features are stored. With --start a training begins
+from other weights; with --steps 0, too, nothing is trained, and these weights are tested on all own
+trials. Predictions of official stimuli go to FOLDER/predictions, where
+``intuition.py --predictions`` reads them, weights to FOLDER/training. --weights names a folder for
+the weights of all scenarios as float16.
 Other trainings answer what a network has to have seen: --counts, the first trials of each scenario
 only; --unseen, without the configuration of the tested trial (`FOLDS` trainings, each without a
 part of the configurations); --all-but, without its scenario. With --write the table is written to
@@ -84,6 +85,8 @@ class Learner:
 
     def __init__(self, name: str, folder: Path, options: argparse.Namespace) -> None:
         self.name, self.folder, self.options = name, folder, options
+        self.alone: list[dict[str, NDArray[np.float64]]] = []
+        """Answers of every network of the model that was trained last."""
         read = [n for n in (name, SAME[name]) if n in names_stored(folder / "own")]
         self.own, self.asked = load(folder / "own", read), load(folder / "official", read)
         keep = ~self.asked["observed_contact"]
@@ -152,10 +155,11 @@ class Learner:
         return self._answers(model)
 
     def _answers(self, model: Any) -> dict[str, NDArray[np.float64]]:
-        return {
-            "own": self._predict(model, self.own, self.held),
-            "official": self._predict(model, self.asked, np.full(len(self.asked["trial"]), True)),
-        }
+        every = np.full(len(self.asked["trial"]), True)
+        own = self._predict(model, self.own, self.held)
+        official = self._predict(model, self.asked, every)
+        self.alone = [{"own": a, "official": b} for a, b in zip(own, official, strict=True)]
+        return {"own": own.mean(0), "official": official.mean(0)}
 
     def train_apart(
         self, name: str, own: NDArray[Any], asked: NDArray[Any]
@@ -242,14 +246,18 @@ class Learner:
     def _predict(
         self, model: Any, made: Mapping[str, NDArray[Any]], chosen: NDArray[np.bool_]
     ) -> NDArray[np.float64]:
+        """Return P(contact) (members, trials) of every network of a model."""
         source, found = OwnSource(model.spec, made), []
         names = [str(trial) for trial in made["trial"][chosen]]
         for start in range(0, len(names), TOGETHER):
             batch = source.context(names[start : start + TOGETHER])
             rows = [source.rows[trial] for trial in batch.trials]
             batch = replace(batch, features=made[self.name][rows])
-            found.append(model.predict(batch.to(model.device)).cpu().numpy())
-        return np.concatenate(found).astype(np.float64)
+            batch = batch.to(model.device)
+            each = model.logits(batch).sigmoid().unflatten(0, (-1, 2)).mean(1)
+            each = torch.where(model.seen(batch), each, model.base_rate)
+            found.append(each.cpu().numpy())
+        return np.concatenate(found, axis=1).astype(np.float64)
 
 
 def device() -> str:
@@ -311,7 +319,10 @@ def main() -> None:
         answers = learner.train()
         learner.keep(learner.title, answers["official"])
         rows.append(learner.row(learner.title, answers))
-        print(rows[-1], flush=True)
+        if len(learner.alone) > 1:
+            for number, each in enumerate(learner.alone, start=1):
+                rows.append(learner.row(f"network {number} of it alone", each))
+        print("\n".join(rows), flush=True)
         if forests := learner.forests():
             learner.keep(SAME[name], forests["official"])
             rows.append(learner.row(SAME[name], forests))

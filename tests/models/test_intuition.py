@@ -14,7 +14,7 @@ from physion.clips.rendered import MotionRenderer
 from physion.core.errors import BadInputError
 from physion.models.build import build_model
 from physion.models.interface import TrainingSettings
-from physion.models.intuition import VIEWS, mask_tokens, state_tokens
+from physion.models.intuition import READINGS, VIEWS, mask_tokens, state_tokens
 from physion.models.segmentation import segment
 from physion.physics.engine import simulate
 from physion.physics.trajectory import Contacts, Trajectory
@@ -132,16 +132,23 @@ def test_tokens_of_masks_hold_the_largest_objects() -> None:
     assert image == pytest.approx(mask_tokens(ids[:, :, ::-1], 3), abs=1e-6)
 
 
-def test_a_network_reads_changes_of_masks_that_are_there_in_both_frames() -> None:
+@pytest.mark.parametrize("reading", [of for of in READINGS["masks"] if of.changes])
+def test_a_network_reads_changes_of_masks_that_are_there_in_both_frames(reading: Any) -> None:
     ids = np.zeros((15, 16, 32), np.uint8)
     ids[:, 10:12, 20:25] = 2
     for frame in range(15):
         ids[frame, 2:6, frame : frame + 4] = 1
     ids[7, :8] = 0
     model: Any = build_model("intuition-masks", objects=3, weights="random")
-    values, there = model._values(torch.from_numpy(mask_tokens(ids, 3))[None])
+    tokens = torch.from_numpy(mask_tokens(ids, 3))[None]
+    values, there = model._values(tokens, reading)
     assert there.tolist() == [[True, True, False]]
-    track = VIEWS["masks"].track
+    track = reading.track
+    assert values.shape == (1, 3, 15 * (2 * len(track) + 3) + 2)
+    other = tokens.clone()
+    left_out = [name not in (*track, "agent", "patient") for name in VIEWS["masks"].columns]
+    other[..., left_out] += 1
+    assert torch.equal(model._values(other, reading)[0], values)
     read = values[0, :, : -len(VIEWS["masks"].constants)].reshape(3, 15, -1)
     changes = dict(zip(track[1:], read[..., 1 - len(track) :].permute(2, 0, 1), strict=True))
     expected = [0.0] + [1 / 32] * 6 + [0.0] * 2 + [1 / 32] * 6
@@ -156,10 +163,24 @@ def test_a_network_reads_changes_of_masks_that_are_there_in_both_frames() -> Non
     model = build_model("intuition-masks", image_size=16, objects=3, weights="random").train()
     model.prepare(replace(sample, contact=torch.tensor([True, False] * 75)))
     tokens = model._tokens(sample)
-    read = model._values(tokens)[0][..., : -len(VIEWS["masks"].constants)].reshape(150, 3, 15, -1)
+    values, _ = model._values(tokens, reading)
+    read = values[..., : -len(VIEWS["masks"].constants)].reshape(150, 3, 15, -1)
     moved = read[:, 0, 1:, 1 - len(track) + track.index("x") - 1]
     assert float(moved.std()) == pytest.approx(1, rel=0.5) and len(torch.unique(moved)) > 2000
     assert (read[:, :, 0, 1 - len(track) :] == 0).all(), "no noise where nothing is before"
+
+
+def test_networks_of_masks_read_different_things_and_their_mean_is_the_answer() -> None:
+    model: Any = build_model("intuition-masks", image_size=16, objects=3, weights="random")
+    assert model.readings == [*READINGS["masks"]] and not model.readings[-1].changes
+    batch = MovingSquares(model.spec).context([f"drop_{number:04d}" for number in range(9)])
+    with torch.no_grad():
+        alone = model.logits(batch).sigmoid().unflatten(0, (-1, 2)).mean(1)
+        answers = model.predict(batch)
+    assert len(alone) == 3 and len(torch.unique(alone[:, 0])) == 3
+    assert torch.allclose(answers, alone.mean(0))
+    four: Any = build_model("intuition-masks", image_size=16, members=4, weights="random")
+    assert four.readings[3] == four.readings[0]
 
 
 def clips(ids: Any, frames: Any = FRAMES) -> Batch:

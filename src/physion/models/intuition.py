@@ -11,9 +11,13 @@ and L blocks of attention over the objects, in no order, lead to the answer
 
     P(contact) = sigmoid( g(x_agent, x_patient, mean_k x_k) ).
 
-Changes d track_k(t) = track_k(t) - track_k(t - 1) are read of true masks only: states hold
-velocities, and found masks flicker. They are 0 in the first frame and where the object is missing
-in one of both. Next to the values they are small, so f reads them in their own standard deviations.
+Changes d track_k(t) = track_k(t) - track_k(t - 1) are read of masks only: states hold velocities.
+They are 0 in the first frame and where the object is missing in one of both. Next to the values
+they are small, so f reads them in their own standard deviations.
+
+Networks that read different things make different errors. So there are three of masks, found ones,
+too, whose probabilities are averaged: one reads all, one all but some columns, and one neither
+these nor changes (`READINGS`).
 
 The loss is the cross entropy of the outcomes. Which object is agent, patient or probe is one of its
 constants. In training a trial is mirrored at random; an answer is the mean of both images, and of
@@ -70,10 +74,10 @@ from physion.scenes.shapes.primitives import shape
 STATE, MASK, PIXELS = "states", "masks", "pixels"
 INPUTS = {STATE: "state", MASK: "ids", PIXELS: "rgb"}
 """What is seen, as an input of a `Spec`."""
-VERSIONS = {STATE: 1, MASK: 2, PIXELS: 1}
-"""Version of tokens and network by what is seen.
+VERSIONS = {STATE: 1, MASK: 2, PIXELS: 2}
+"""Version of tokens by what is seen.
 
-2 of masks: tokens hold how far they reach in twelve directions, and the network reads changes."""
+2 of masks, also of found ones: tokens hold how far they reach in twelve directions."""
 _CORNERS = tuple(f"corner {x}{y}{z}" for x in "-+" for y in "-+" for z in "-+")
 TURNS = tuple(turn for turn in range(16) if turn % 4)
 """Directions in a picture, in 16ths of a turn from right over down; the box has the other four."""
@@ -88,7 +92,6 @@ class TokenColumns:
     - ``place``: columns of a track that are also given relative to agent and patient.
     - ``negated``: columns with the other sign in the mirror image. ``swapped``: pairs of columns
       that change places there.
-    - ``changes``: whether a network reads the changes of a track, too; tokens do not hold them.
     """
 
     track: tuple[str, ...]
@@ -96,7 +99,6 @@ class TokenColumns:
     place: tuple[str, ...]
     negated: frozenset[str]
     swapped: tuple[tuple[str, str], ...]
-    changes: bool
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -110,16 +112,20 @@ class TokenColumns:
         return order, [-1.0 if name in self.negated else 1.0 for name in self.columns]
 
 
-_FOUND = TokenColumns(
-    track=(
-        "there", "area", "x", "y", "width", "height", "slant", "left", "top", "right", "bottom",
-    ),
+_BLOB = (
+    "there", "area", "x", "y", "width", "height", "slant", "left", "top", "right", "bottom",
+)  # fmt: skip
+"""Columns of a track of masks without reaches."""
+_MASKS = TokenColumns(
+    track=(*_BLOB, *_REACHES),
     constants=("agent", "patient"),
     place=("x", "y"),
     negated=frozenset(("x", "slant", "left", "right")),
-    swapped=(("left", "right"),),
-    changes=False,
-)  # fmt: skip
+    swapped=(
+        ("left", "right"),
+        *((f"reach {turn}", f"reach {(8 - turn) % 16}") for turn in TURNS if turn % 8 < 4),
+    ),
+)
 VIEWS: Mapping[str, TokenColumns] = {
     STATE: TokenColumns(
         track=(
@@ -133,18 +139,9 @@ VIEWS: Mapping[str, TokenColumns] = {
         place=("x", "y", "z"),
         negated=frozenset(("y", "axis y", "up y", "vy", "wx", "wz")),
         swapped=tuple((f"corner {x}-{z}", f"corner {x}+{z}") for x in "-+" for z in "-+"),
-        changes=False,
     ),
-    MASK: replace(
-        _FOUND,
-        track=(*_FOUND.track, *_REACHES),
-        swapped=(
-            *_FOUND.swapped,
-            *((f"reach {turn}", f"reach {(8 - turn) % 16}") for turn in TURNS if turn % 8 < 4),
-        ),
-        changes=True,
-    ),
-    PIXELS: _FOUND,
+    MASK: _MASKS,
+    PIXELS: _MASKS,
 }  # fmt: skip
 """Columns by what is seen.
 
@@ -152,11 +149,30 @@ VIEWS: Mapping[str, TokenColumns] = {
   and angular velocity (asinh of m/s and rad/s); size in metres, fraction of the bounding box that
   the shape fills, and how far it reaches into the corners of the box. The origin lies on the floor
   below the patient, the first axis points to the agent, both at the last observed frame.
-- ``masks``: square root of the area, mean, standard deviations and covariance of the pixels, and
-  the box around them from the middle of the picture, and how far the pixels reach from their mean
-  in twelve directions, in fractions of the picture. Reaches tell how a body is turned.
-- ``pixels``: the same of masks that are found, without reaches and changes: their borders flicker.
+- ``masks``, true or found in ``pixels``: square root of the area, mean, standard deviations and
+  covariance of the pixels, and the box around them from the middle of the picture, and how far the
+  pixels reach from their mean in twelve directions, in fractions of the picture. Reaches tell how a
+  body is turned.
 """
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What a network reads of tokens: columns of tracks, and whether their changes, too."""
+
+    track: tuple[str, ...]
+    changes: bool = False
+
+
+_OF_MASKS = (
+    Reading(_MASKS.track, changes=True), Reading(_BLOB, changes=True), Reading(_BLOB),
+)  # fmt: skip
+READINGS: Mapping[str, tuple[Reading, ...]] = {
+    STATE: (Reading(VIEWS[STATE].track),),
+    MASK: _OF_MASKS,
+    PIXELS: _OF_MASKS,
+}
+"""What the networks of a model read, by what is seen; with more members the first again."""
 
 
 # Tokens of states.
@@ -278,18 +294,16 @@ def _reach(name: str) -> tuple[float, ...]:
 # Tokens of masks.
 
 
-def mask_tokens(
-    ids: NDArray[np.uint8], objects: int, view: TokenColumns = VIEWS[MASK]
-) -> NDArray[np.float32]:
+def mask_tokens(ids: NDArray[np.uint8], objects: int) -> NDArray[np.float32]:
     """Return the tokens (T, K, D) of a clip from the objects of its pixels (T, H, W).
 
     The first two are agent and patient, then come the others with the most pixels in all frames.
-    ``view`` says which columns D they have.
     """
     pixels = np.bincount(ids.ravel(), minlength=256)[FIRST_OTHER_ID:]
     others = [n for n in np.argsort(-pixels, kind="stable")[: objects - 2] if pixels[n] > 0]
     numbers = [AGENT_ID, PATIENT_ID, *(FIRST_OTHER_ID + int(number) for number in others)]
-    tokens = np.zeros((len(ids), objects, len(view.columns)), np.float32)
+    tracked = len(_MASKS.track)
+    tokens = np.zeros((len(ids), objects, len(_MASKS.columns)), np.float32)
     for place, number in enumerate(numbers):
         mask = ids == number
         blob = mask_blob(mask)
@@ -297,11 +311,10 @@ def mask_tokens(
         # Area, mean and box count from the middle of the picture.
         values = blob - np.array([0, 0.5, 0.5, 0, 0, 0, 0.5, 0.5, 0.5, 0.5], np.float32)
         values[:, 0] = np.sqrt(blob[:, 0])
-        if view.track[-1] in _REACHES:
-            values = np.concatenate([values, mask_reach(mask, blob[:, 1:3])], 1)
+        values = np.concatenate([values, mask_reach(mask, blob[:, 1:3])], 1)
         tokens[:, place, 0] = seen
-        tokens[seen, place, 1 : len(view.track)] = values[seen]
-        tokens[:, place, len(view.track) :] = (place == 0, place == 1)
+        tokens[seen, place, 1:tracked] = values[seen]
+        tokens[:, place, tracked:] = (place == 0, place == 1)
     return tokens
 
 
@@ -344,7 +357,8 @@ class IntuitionSettings(SizedSettings):
     - ``width``, ``layers``, ``heads``: of the network. ``dropout``: in training.
     - ``noise``: standard deviation of noise on values of tokens and, independently, on their
       changes in training, in standard deviations of each.
-    - ``members``: networks, trained at the same time, whose probabilities are averaged.
+    - ``members``: networks, trained at the same time, whose probabilities are averaged; by default
+      as many as `READINGS` has.
     - ``cue``: from pixels only: objects may have any colours, and the masks of the first frame of
       the clip show which are agent and patient, as a cue showed people. Other masks are not looked
       at. The weights are the same.
@@ -368,12 +382,13 @@ class IntuitionSettings(SizedSettings):
     def defaults(cls, model: str, options: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return the settings of a model.
 
-        States have more tokens. True masks have more pixels, and are trained with more noise and
-        dropout, with which the loss of held-out trials was smaller.
+        States have more tokens. Masks are trained with more noise and dropout, with which the loss
+        of held-out trials was smaller, and true ones have more pixels.
         """
-        own: dict[str, Any] = {"objects": 12 if model == "intuition-states" else 8}
-        if model == "intuition-masks":
-            own |= {"image_size": 192, "dropout": 0.2, "noise": 0.05}
+        kind = model.partition("-")[2]
+        own: dict[str, Any] = {"members": len(READINGS[kind])}
+        own |= {"objects": 12} if kind == STATE else {"dropout": 0.2, "noise": 0.05}
+        own |= {"image_size": 192} if kind == MASK else {}
         return {**own, **super().defaults(model, options)}
 
     def __post_init__(self) -> None:
@@ -507,21 +522,22 @@ class Intuition(TorchModel):
             stride=STRIDE, context=CONTEXT, future=0, framewise=False,
         )  # fmt: skip
         self.view = VIEWS[self.kind]
-        tracked, places = len(self.view.track), len(self.view.place)
-        changing = tracked - 1 if self.view.changes else 0
-        inputs = CONTEXT * (tracked + 2 * places + changing) + len(self.view.constants)
+        readings = READINGS[self.kind]
+        self.readings = [readings[n % len(readings)] for n in range(settings.members)]
         with initial_weights(settings.model, settings.seed):
             self.networks = nn.ModuleList(
                 TokenNetwork(
-                    inputs, settings.width, settings.layers, settings.heads, settings.dropout
+                    self._inputs(reading), settings.width, settings.layers, settings.heads,
+                    settings.dropout,
                 )
-                for _ in range(settings.members)
-            )
-        columns = len(self.view.columns)
+                for reading in self.readings
+            )  # fmt: skip
+        columns, changing = len(self.view.columns), len(self.view.track) - 1
         self.base_rate = nn.Buffer(torch.tensor(0.5))
         self.center = nn.Buffer(torch.zeros(columns))
         self.scale = nn.Buffer(torch.ones(columns))
-        self.change_scale = nn.Buffer(torch.ones(changing)) if changing else None
+        changes = any(reading.changes for reading in self.readings)
+        self.change_scale = nn.Buffer(torch.ones(changing)) if changes else None
         order, signs = self.view.mirror()
         self.order = nn.Buffer(torch.tensor(order), persistent=False)
         self.signs = nn.Buffer(torch.tensor(signs), persistent=False)
@@ -566,7 +582,7 @@ class Intuition(TorchModel):
             rows = zip(motions(batch, self.name), batch.trials, shown, strict=True)
             tokens = [state_tokens(motion, trial, of, objects) for motion, trial, of in rows]
         else:
-            tokens = [mask_tokens(ids, objects, self.view) for ids in self._ids(batch)]
+            tokens = [mask_tokens(ids, objects) for ids in self._ids(batch)]
         return torch.from_numpy(np.stack(tokens)).flatten(2).to(self.device)
 
     def predict(self, batch: Batch) -> Tensor:
@@ -589,7 +605,7 @@ class Intuition(TorchModel):
         if self.settings.cue:
             unseen = "agent or patient not visible in the first frame"
         if ids is not None:
-            tokens = np.stack([mask_tokens(one, most, self.view) for one in ids])
+            tokens = np.stack([mask_tokens(one, most) for one in ids])
             batch = replace(batch, features=torch.from_numpy(tokens).flatten(2).to(self.device))
         for seen, count in zip(self.seen(batch).tolist(), self._counts(batch, ids), strict=True):
             hidden = "" if seen else f"{unseen}: base rate"
@@ -601,7 +617,10 @@ class Intuition(TorchModel):
         """Return logits (2 members, B), each member of the trial and of its mirror image."""
         tokens = self._tokens(batch)
         images = (tokens, self._mirrored(tokens))
-        return torch.stack([net(*self._values(image)) for net in self.networks for image in images])
+        logits = []
+        for network, reading in zip(self.networks, self.readings, strict=True):
+            logits += [network(*self._values(image, reading)) for image in images]
+        return torch.stack(logits)
 
     def seen(self, batch: Batch) -> Tensor:
         """Return whether agent and patient are both seen in some frame (B,)."""
@@ -632,10 +651,10 @@ class Intuition(TorchModel):
         """Return the mean cross entropy of the outcomes, and how many answers are right."""
         tokens = self._tokens(batch)
         logits = []
-        for network in self.networks:
+        for network, reading in zip(self.networks, self.readings, strict=True):
             turned = torch.rand(len(batch), device=tokens.device) < 0.5
             image = torch.where(turned[:, None, None, None], self._mirrored(tokens), tokens)
-            logits.append(network(*self._values(image)))
+            logits.append(network(*self._values(image, reading)))
         answers = torch.stack(logits)
         contact = batch.contact.float().expand_as(answers)
         right = ((answers.sigmoid().mean(0) > 0.5) == batch.contact).float().mean()
@@ -652,31 +671,41 @@ class Intuition(TorchModel):
         image: Tensor = tokens[..., self.order] * self.signs
         return image
 
-    def _values(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what the network reads of tokens (B, T, K, D), and which objects are there."""
-        view, steps = self.view, tokens.shape[1]
-        present = tokens[..., :1]
-        scaled = self._noisy((tokens - self.center) / self.scale)
+    def _inputs(self, reading: Reading) -> int:
+        """Return how many values of a token a network with this reading has."""
+        tracked = len(reading.track)
+        changing = tracked - 1 if reading.changes else 0
+        of_frame = tracked + 2 * len(self.view.place) + changing
+        return CONTEXT * of_frame + len(self.view.constants)
+
+    def _values(self, tokens: Tensor, reading: Reading) -> tuple[Tensor, Tensor]:
+        """Return what a network reads of tokens (B, T, K, D), and which objects are there."""
+        names = (*reading.track, *self.view.constants)
+        chosen, tracked = [self.view.columns.index(name) for name in names], len(reading.track)
+        tokens, present = tokens[..., chosen], tokens[..., :1]
+        scaled = self._noisy((tokens - self.center[chosen]) / self.scale[chosen])
         # Presence is 0 or 1 and stays so; values of absent objects are zeros.
         scaled = torch.cat([present, scaled[..., 1:] * present], -1)
-        columns = [view.columns.index(name) for name in view.place]
+        columns = [names.index(name) for name in self.view.place]
         places, shown = scaled[..., columns], present
         relative = [
             (places - places[:, :, who, None]) * shown * shown[:, :, who, None] for who in (0, 1)
         ]
-        parts = [scaled[..., : len(view.track)], *relative]
-        if self.change_scale is not None:
-            changes, both = _changes(tokens[..., : len(view.track)])
-            changes = self._noisy(changes / self.change_scale) * both
+        parts = [scaled[..., :tracked], *relative]
+        if reading.changes:
+            assert self.change_scale is not None
+            changes, both = _changes(tokens[..., :tracked])
+            # The first column, presence, has no changes.
+            of_column = self.change_scale[[place - 1 for place in chosen[1:tracked]]]
+            changes = self._noisy(changes / of_column) * both
             # Nothing is before the first frame: no change.
             parts.append(functional.pad(changes, (0, 0, 0, 0, 1, 0)))
         tracks = torch.cat(parts, -1)
-        constants = scaled[..., len(view.track) :].sum(1) / present.sum(1).clamp(min=1)
+        constants = scaled[..., tracked:].sum(1) / present.sum(1).clamp(min=1)
         values = tracks.transpose(1, 2).reshape(len(tokens), tokens.shape[2], -1)
         there = (present[..., 0] > 0).any(1)
         # Attention needs something to look at.
         there = there | ~there.any(1, keepdim=True)
-        assert values.shape[2] == steps * tracks.shape[3]
         return torch.cat([values, constants], -1), there
 
     def _noisy(self, values: Tensor) -> Tensor:
