@@ -302,9 +302,7 @@ def test_pixels_become_the_tokens_of_the_masks_that_are_found() -> None:
     true: Any = build_model("intuition-masks", image_size=96, weights="random")
     batch = pictures(drawn["rgb"][None], ["new"])
     tokens = model.encode(batch)
-    assert np.array_equal(
-        tokens[0].reshape(15, 8, -1), mask_tokens(segment(drawn["rgb"]), 8, VIEWS["pixels"])
-    )
+    assert np.array_equal(tokens[0].reshape(15, 8, -1), mask_tokens(segment(drawn["rgb"]), 8))
     expected = true.encode(clips(drawn["ids"][None]))[0].reshape(15, 8, -1)
     found = tokens[0].reshape(15, 8, -1)
     # Agent and patient: there, area, x, y and the others, in fractions of the picture.
@@ -347,10 +345,8 @@ def test_with_a_cue_only_the_masks_of_the_first_frame_count() -> None:
     assert model.spec.inputs == ("rgb", "ids")
     batch = replace(pictures(drawn["rgb"][None], ["new"]), ids=drawn["ids"][None])
     tokens = model.encode(batch)
-    assert np.array_equal(
-        tokens[0].reshape(15, 8, -1),
-        mask_tokens(segment(drawn["rgb"], drawn["ids"][0]), 8, VIEWS["pixels"]),
-    )
+    found = mask_tokens(segment(drawn["rgb"], drawn["ids"][0]), 8)
+    assert np.array_equal(tokens[0].reshape(15, 8, -1), found)
     later = drawn["ids"].copy()
     later[1:] = 0
     assert torch.equal(model.encode(replace(batch, ids=later[None])), tokens)

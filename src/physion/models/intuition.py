@@ -170,7 +170,7 @@ _OF_MASKS = (
 READINGS: Mapping[str, tuple[Reading, ...]] = {
     STATE: (Reading(VIEWS[STATE].track),),
     MASK: _OF_MASKS,
-    PIXELS: _OF_MASKS,
+    PIXELS: (*_OF_MASKS, Reading(_BLOB)),
 }
 """What the networks of a model read, by what is seen; with more members the first again."""
 
@@ -514,7 +514,7 @@ class Intuition(TorchModel):
         settings.check_shipped()
         self.name = f"{settings.model}-{settings.size}"
         self.kind = settings.model.partition("-")[2]
-        if self.kind == MASK:
+        if self.kind != STATE:
             self.training_settings = replace(TRAINING, steps=3000)
         self.settings, self.seed, self.window = settings, settings.seed, CONTEXT
         self.spec = Spec(
