@@ -15,8 +15,9 @@ without Drape, since simulations of cloth are slow. Five tables:
    simulation from the true state; mixtures of both, with weights fitted on own trials or, where the
    name says so, to people's answers to one half of the stimuli, and tested on the other half;
    predictions of other models (--predictions FILE); answers that have the values of another, by
-   rank; levels of noise fitted to people in the same way; forests, networks of intuition and
-   levels of noise together, with equal weights and with weights fitted to people.
+   rank; levels of noise fitted to people in the same way; each network of intuition with the
+   forests that see as much; forests, networks of intuition and levels of noise together, with equal
+   weights and with weights fitted to people.
 3. What the best model could reach, from halves of the people, and the weights of mixtures.
 4. Differences of likeness beyond the outcome between learned and simulated answers, paired over
    stimuli.
@@ -62,6 +63,11 @@ from physion.report.compare import CompareResult, compare
 RESULTS = Path(__file__).parents[1] / "results" / "intuition.md"
 MODELS = ("state-trees", "mask-trees", "blob-trees")
 GIVEN = {"state-trees": "states", "mask-trees": "masks", "blob-trees": "blobs"}
+ALIKE = {
+    "intuition-states-small": "states", "intuition-masks-small": "masks",
+    "intuition-pixels-small": "blobs",
+}  # fmt: skip
+"""Networks and the forests that see as much."""
 SCALES = (1.0, 2.0, 4.0)
 """Scales of the noise of simulations; the first is the default."""
 CONTACTS = (0.1, 0.4)
@@ -380,6 +386,9 @@ def main() -> None:
         weights.append(
             f"| {given}, people | {found[:, 0].mean():.2f} | {found[:, 1:-1].sum(1).mean():.2f} |"
         )
+    for name in [name for name in learned if name in ALIKE]:
+        both = (answers[name] + answers[ALIKE[name]]) / 2
+        answers[f"mean of {name} and {ALIKE[name]}"] = both
     together = pd.DataFrame({name: answers[name] for name in (*GIVEN.values(), *learned)})
     together = together.join(every_level)
     answers["mean of forests, networks and simulations"] = together.mean(axis=1)

@@ -377,6 +377,20 @@ def test_marks_of_conditions_stand_in_the_row_of_their_model() -> None:
     assert any(np.allclose(line.get_xdata(), 0.7) for line in axis.lines)
 
 
+def test_a_condition_has_the_same_mark_in_all_panels() -> None:
+    columns = ["panel", "model", "group", "value", "low", "high", "people"]
+    rows = [
+        (panel, "one", group, 0.5, 0.4, 0.6, np.nan)
+        for panel, groups in (("left", ("all", "all-but", "only")), ("right", ("all", "only")))
+        for group in groups
+    ]
+    drawn = [
+        {line.get_label(): line.get_color() for line in axis.get_legend().legend_handles}  # type: ignore[union-attr]
+        for axis in grouped_figure(pd.DataFrame(rows, columns=columns)).axes[:2]
+    ]
+    assert list(drawn[1]) == ["all", "only"] and drawn[1].items() < drawn[0].items()
+
+
 def test_cells_of_the_generalization_are_of_their_row_and_column() -> None:
     rows = [
         ("m", trained, tested, 0.1 * i + 0.01 * j, 0.7)

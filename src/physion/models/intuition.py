@@ -15,9 +15,9 @@ Changes d track_k(t) = track_k(t) - track_k(t - 1) are read of masks only: state
 They are 0 in the first frame and where the object is missing in one of both. Next to the values
 they are small, so f reads them in their own standard deviations.
 
-Networks that read different things make different errors. So there are three of masks, found ones,
-too, whose probabilities are averaged: one reads all, one all but some columns, and one neither
-these nor changes (`READINGS`).
+Networks that read different things make different errors. So there are three of masks, whose
+probabilities are averaged: one reads all, one all but some columns, and one neither these nor
+changes. Of found masks, whose borders flicker, a fourth reads what the third reads (`READINGS`).
 
 The loss is the cross entropy of the outcomes. Which object is agent, patient or probe is one of its
 constants. In training a trial is mirrored at random; an answer is the mean of both images, and of

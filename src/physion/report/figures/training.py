@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import matplotlib
@@ -41,18 +41,20 @@ PROTOCOLS = (
 def grouped_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
     """Draw accuracy by model (rows) and condition (marks).
 
-    ``table``: see `figure_tables.GROUPED_COLUMNS`; one panel for each of its ``panel``.
+    ``table``: see `figure_tables.GROUPED_COLUMNS`; one panel for each of its ``panel``. A condition
+    has the same mark in all panels.
     """
-    names = list(table["panel"].unique())
+    names, groups = list(table["panel"].unique()), list(table["group"].unique())
     models = list(table["model"].unique())
     with matplotlib.rc_context(style(theme)):
         size = (11 / len(names), (0.34 if len(models) <= 8 else 0.27) * len(models) + 0.9)
         figure, axes = panels(len(names), len(names), size, above=0.3, sharex=True, sharey=True)
         for axis, name in zip(axes, names, strict=True):
             rows = table[table["panel"] == name]
-            groups = list(rows["group"].unique())
             for place, group in enumerate(groups):
                 subset = rows[rows["group"] == group]
+                if subset.empty:
+                    continue
                 at = subset["model"].map(models.index) + (place - (len(groups) - 1) / 2) * 0.24
                 _group_marks(axis, subset, at.to_numpy(dtype=np.float64), theme.mark(place), theme)
             axis.axvline(0.5, color=theme.faint, linestyle=":", linewidth=1, zorder=0)
@@ -65,7 +67,8 @@ def grouped_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
             axis.set_ylim(len(models) - 0.5, -0.5)
             axis.grid(axis="y", color=theme.zone, linewidth=0.5)
             axis.set_axisbelow(True)
-            axis.legend(handles=_group_handles(groups, people, theme), loc="lower center",
+            handles = _group_handles(groups, set(rows["group"]), people, theme)
+            axis.legend(handles=handles, loc="lower center",
                         bbox_to_anchor=(0.5, 1.02 + 0.18 / len(models)), fontsize=8,
                         ncols=5 if len(names) < 3 else 2,
                         handletextpad=0.4, columnspacing=1.2)  # fmt: skip
@@ -81,13 +84,16 @@ def _group_marks(
               markeredgecolor=theme.ink, markeredgewidth=0.6)  # fmt: skip
 
 
-def _group_handles(groups: Sequence[str], people: float, theme: Theme) -> list[Line2D]:
+def _group_handles(
+    groups: Sequence[str], shown: Collection[str], people: float, theme: Theme
+) -> list[Line2D]:
     handles = []
     for place, group in enumerate(groups):
-        colour, marker = theme.mark(place)
-        handles.append(
-            Line2D([], [], color=colour, marker=marker, markeredgecolor=theme.ink, label=group)
-        )
+        if group in shown:
+            colour, marker = theme.mark(place)
+            handles.append(
+                Line2D([], [], color=colour, marker=marker, markeredgecolor=theme.ink, label=group)
+            )
     if np.isfinite(people):
         handles.append(Line2D([], [], color=theme.ink, linestyle="--", label="people"))
     return handles
