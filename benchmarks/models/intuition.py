@@ -409,8 +409,8 @@ def main() -> None:
             f"--many {options.many} {'--predictions FILES.csv ' * bool(options.predictions)}"
             "--write`, "
             f"{datetime.date.today()}, {processor()}: {len(trials.tested)} official stimuli "
-            f"without contact in the observed part, recorded outcomes; {counts.min()} to "
-            f"{counts.max()} own trials per scenario.",
+            "without contact in the observed part, recorded outcomes; own trials per scenario: "
+            f"{' to '.join(str(n) for n in sorted({counts.min(), counts.max()}))}.",
             "",
             "Accuracy, mean of the seven rigid scenarios, by number of own trials per scenario:",
             "",
