@@ -16,8 +16,8 @@ without Drape, since simulations of cloth are slow. Five tables:
    name says so, to people's answers to one half of the stimuli, and tested on the other half;
    predictions of other models (--predictions FILE); answers that have the values of another, by
    rank; levels of noise fitted to people in the same way; each network of intuition with the
-   forests that see as much; forests, networks of intuition and levels of noise together, with equal
-   weights and with weights fitted to people.
+   forests that are given the same; forests, networks of intuition and levels of noise together,
+   with equal weights and with weights fitted to people.
 3. What the best model could reach, from halves of the people, and the weights of mixtures.
 4. Differences of likeness beyond the outcome between learned and simulated answers, paired over
    stimuli.
@@ -67,7 +67,7 @@ ALIKE = {
     "intuition-states-small": "states", "intuition-masks-small": "masks",
     "intuition-pixels-small": "blobs",
 }  # fmt: skip
-"""Networks and the forests that see as much."""
+"""Networks and the forests that are given the same: states, masks or pixels."""
 SCALES = (1.0, 2.0, 4.0)
 """Scales of the noise of simulations; the first is the default."""
 CONTACTS = (0.1, 0.4)

@@ -1,9 +1,9 @@
 """Intuition: P(contact) from what was observed, learned from the outcomes of own trials.
 
-One network for all scenarios. It simulates nothing and knows no physics: it has seen many trials
-and how they ended. An object is a token, which holds its track over the observed frames 2, 5, ...,
-44, from the true state (`intuition-states`), from its true mask (`intuition-masks`), or from the
-mask that a network finds in pictures (`intuition-pixels`, `physion.models.segmentation`):
+All scenarios have the same networks. They simulate nothing and know no physics: they have seen
+many trials and how they ended. An object is a token, which holds its track over the observed frames
+2, 5, ..., 44, from the true state (`intuition-states`), from its true mask (`intuition-masks`), or
+from the mask that a network finds in pictures (`intuition-pixels`, `physion.models.segmentation`):
 
     x_k = f(track_k, track_k - track_agent, track_k - track_patient, d track_k, constants_k),
 
@@ -16,8 +16,8 @@ They are 0 in the first frame and where the object is missing in one of both. Ne
 they are small, so f reads them in their own standard deviations.
 
 Networks that read different things make different errors. So there are three of masks, whose
-probabilities are averaged: one reads all, one all but some columns, and one neither these nor
-changes. Of found masks, whose borders flicker, a fourth reads what the third reads (`READINGS`).
+probabilities are averaged: one reads all, one all but reaches, and one neither reaches nor changes.
+Of found masks, whose borders may flicker, a fourth reads what the third reads (`READINGS`).
 
 The loss is the cross entropy of the outcomes. Which object is agent, patient or probe is one of its
 constants. In training a trial is mirrored at random; an answer is the mean of both images, and of
@@ -158,7 +158,10 @@ VIEWS: Mapping[str, TokenColumns] = {
 
 @dataclass(frozen=True)
 class Reading:
-    """What a network reads of tokens: columns of tracks, and whether their changes, too."""
+    """What a network reads of tokens: columns of tracks, and whether their changes, too.
+
+    The first column is *there*.
+    """
 
     track: tuple[str, ...]
     changes: bool = False
@@ -172,7 +175,7 @@ READINGS: Mapping[str, tuple[Reading, ...]] = {
     MASK: _OF_MASKS,
     PIXELS: (*_OF_MASKS, Reading(_BLOB)),
 }
-"""What the networks of a model read, by what is seen; with more members the first again."""
+"""What the networks of a model read, by what is seen; with more members from the first again."""
 
 
 # Tokens of states.
@@ -382,8 +385,9 @@ class IntuitionSettings(SizedSettings):
     def defaults(cls, model: str, options: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return the settings of a model.
 
-        States have more tokens. Masks are trained with more noise and dropout, with which the loss
-        of held-out trials was smaller, and true ones have more pixels.
+        There are as many ``members`` as there are readings. States have more tokens. Masks are
+        trained with more noise and dropout, with which the loss of held-out trials was smaller (of
+        true masks), and true ones have more pixels.
         """
         kind = model.partition("-")[2]
         own: dict[str, Any] = {"members": len(READINGS[kind])}
@@ -560,7 +564,8 @@ class Intuition(TorchModel):
     def digest(self) -> str:
         """Return the SHA-256 of code version, settings and weights."""
         settings = {k: v for k, v in asdict(self.settings).items() if k not in ("weights", "seed")}
-        made = [self.name, VERSIONS[self.kind], settings, repr(self.spec), *self._segmentation()]
+        made = [self.name, VERSIONS[self.kind], settings, repr(self.spec), repr(self.readings)]
+        made += self._segmentation()
         return weights_digest([*made, torch.__version__], self.state_dict().items())
 
     def encoder_digest(self) -> str:
@@ -628,7 +633,10 @@ class Intuition(TorchModel):
         return seen
 
     def prepare(self, sample: Batch) -> None:
-        """Set base rate, mean and deviation of the values of objects, unless weights were given."""
+        """Set the base rate, mean and deviation of values, and deviation of their changes.
+
+        Given weights keep their own.
+        """
         if self.trained:
             return
         self.base_rate.copy_(sample.contact.float().mean())
