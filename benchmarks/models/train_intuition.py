@@ -318,11 +318,12 @@ def main() -> None:
         learner = Learner(name, options.folder, options)
         answers = learner.train()
         learner.keep(learner.title, answers["official"])
-        rows.append(learner.row(learner.title, answers))
+        found = [learner.row(learner.title, answers)]
         if len(learner.alone) > 1:
             for number, each in enumerate(learner.alone, start=1):
-                rows.append(learner.row(f"network {number} of it alone", each))
-        print("\n".join(rows), flush=True)
+                found.append(learner.row(f"network {number} of it alone", each))
+        print("\n".join(found), flush=True)
+        rows += found
         if forests := learner.forests():
             learner.keep(SAME[name], forests["official"])
             rows.append(learner.row(SAME[name], forests))
