@@ -20,8 +20,8 @@ models were trained on movies of 64 px:
     physion train op3 MOVIES --out TRAINED --option steps=1500
 
 The weights of SVG are stored as float16. With --scores only the cards are written again, with the
-digests of the weights and the tables of ``results/particles.md``, ``vision_models.md`` and
-``intuition_networks.md``. Weights and cards of intuition are those of ``train_intuition.py``.
+digests of the weights and the tables of ``results/particles.md`` and ``vision_models.md``.
+``train_intuition.py`` writes the weights and cards of intuition.
 """
 
 from __future__ import annotations
@@ -127,9 +127,8 @@ def write_scores() -> None:
     tables = [
         *tables_of((RESULTS / "particles.md").read_text(), "| model | scenario |"),
         *tables_of((RESULTS / "vision_models.md").read_text(), "| model | metric |"),
-        *tables_of((RESULTS / "intuition_networks.md").read_text(), "| model | trials per"),
     ]
-    for name in sorted(path.stem for path in SHIPPED.glob("*.safetensors")):
+    for name in SOURCES:
         text = ["## Weights", f"SHA-256 of {name}.safetensors: {digests[name]}", "", "## Scores"]
         for title, head, rows in tables:
             own = [row for row in rows if row.startswith(f"| {name} |")]

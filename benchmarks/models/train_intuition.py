@@ -46,6 +46,7 @@ from physion.models.interface import ask
 from physion.readout.trees import fit_forest
 from physion.training.loop import CARD
 from physion.training.train import train_model
+from vision_models import write_section
 
 RESULTS = Path(__file__).parents[1] / "results"
 FOLDS = 5
@@ -313,80 +314,74 @@ def main() -> None:
     other = options.counts or options.unseen or options.all_but
     if other and len(options.models) > 1:
         raise SystemExit("--counts, --unseen and --all-but need one of --models")
-    rows, curves = [], []
     for name in options.models:
         learner = Learner(name, options.folder, options)
-        answers = learner.train()
-        learner.keep(learner.title, answers["official"])
-        found = [learner.row(learner.title, answers)]
-        if len(learner.alone) > 1:
-            for number, each in enumerate(learner.alone, start=1):
-                found.append(learner.row(f"network {number} of it alone", each))
-        print("\n".join(found), flush=True)
-        rows += found
-        if forests := learner.forests():
-            learner.keep(SAME[name], forests["official"])
-            rows.append(learner.row(SAME[name], forests))
-            both = {part: (answers[part] + forests[part]) / 2 for part in answers}
-            rows.append(learner.row(f"mean of both, {name}", both))
-            print("\n".join(rows[-2:]), flush=True)
-        own, asked = learner.own, learner.asked
-        fit = pd.Series(own["scenario"][~learner.held]).value_counts()
-        if max(options.counts, default=0) > fit.min():
-            raise SystemExit(f"--counts: some scenario has only {fit.min()} trials for training")
-        others = {
-            f"{name}, {count} trials": (
-                learner.train(f"first_{count}", learner.number < count),
-                count,
-            )
-            for count in options.counts
-        }
-        if options.counts:
-            rigid = [learner.rigid(one) for one, _ in others.values()]
-            most = int((~learner.held).sum() / len(np.unique(own["scenario"])))
-            rises = slope([*options.counts, most], [*rigid, learner.rigid(answers)])
-            curves.append(f"{name} {rises:+.3f}")
-        if options.unseen:
-            answers = learner.train_apart("fold", *learner.configurations())
-            others[f"{name}, configuration unseen"] = answers, None
-        if options.all_but:
-            answers = learner.train_apart("no", own["scenario"], asked["scenario"])
-            others[f"{name}, scenario unseen"] = answers, None
-        for title, (answers, count) in others.items():
-            learner.keep(title, answers["official"])
-            rows.append(learner.row(title, answers, count))
-            print(rows[-1], flush=True)
-    scenarios = [str(s) for s in np.unique(learner.own["scenario"])]
+        title, text = section(learner)
+        if options.write:
+            page = f"{name}_unseen.md" if other else "intuition_networks.md"
+            write_section(RESULTS / page, title, text)
+
+
+def section(learner: Learner) -> tuple[str, str]:
+    """Train a model as the options say; return title and text of its section of the results."""
+    name, options = learner.name, learner.options
+    rows: list[str] = []
+
+    def add(row: str) -> None:
+        print(row, flush=True)
+        rows.append(row)
+
+    answers = learner.train()
+    learner.keep(learner.title, answers["official"])
+    add(learner.row(learner.title, answers))
+    if len(learner.alone) > 1:
+        for number, each in enumerate(learner.alone, start=1):
+            add(learner.row(f"network {number} of it alone", each))
+    if forests := learner.forests():
+        learner.keep(SAME[name], forests["official"])
+        add(learner.row(SAME[name], forests))
+        both = {part: (answers[part] + forests[part]) / 2 for part in answers}
+        add(learner.row("mean of both", both))
+    own, asked = learner.own, learner.asked
+    fit = pd.Series(own["scenario"][~learner.held]).value_counts()
+    if max(options.counts, default=0) > fit.min():
+        raise SystemExit(f"--counts: some scenario has only {fit.min()} trials for training")
+    most = int((~learner.held).sum() / len(np.unique(own["scenario"])))
+    rigid = []
+    for count in options.counts:
+        found = learner.train(f"first_{count}", learner.number < count)
+        rigid.append(learner.rigid(found))
+        learner.keep(f"{name}, {count} trials", found["official"])
+        add(learner.row(f"{name}, {count} trials", found, count))
+    groups: dict[str, Sequence[NDArray[Any]]] = {}
+    if options.unseen:
+        groups["configuration"] = learner.configurations()
+    if options.all_but:
+        groups["scenario"] = own["scenario"], asked["scenario"]
+    for what, (own_groups, asked_groups) in groups.items():
+        short = "fold" if what == "configuration" else "no"
+        found = learner.train_apart(short, own_groups, asked_groups)
+        learner.keep(f"{name}, {what} unseen", found["official"])
+        add(learner.row(f"{name}, {what} unseen", found))
+    scenarios = [str(s) for s in np.unique(own["scenario"])]
     given = " --start WEIGHTS" * bool(options.start)
     given += f" --steps {options.steps}" * (options.steps is not None)
     given += f" --counts {' '.join(map(str, options.counts))}" * bool(options.counts)
     given += " --unseen" * options.unseen + " --all-but" * options.all_but
-    text = "\n".join(
-        [
-            "# Networks of intuition and forests",
-            f"`python benchmarks/models/train_intuition.py FOLDER --models "
-            f"{' '.join(options.models)}{given} --write`, {datetime.date.today()}, {device()}.",
-            "",
-            "Accuracy of networks over all scenarios, and of forests, one per scenario, where "
-            "features for them are stored: on the last tenth of the own trials, and on "
-            f"{len(learner.asked['trial'])} official stimuli without contact in the observed part "
-            "(recorded outcomes), mean of the rigid scenarios; and on official stimuli of each "
-            "scenario."
-            + " The training began from weights that may have seen these own trials, also those "
-            "that are held out." * bool(options.start),
-            "",
-            "| model | trials per scenario | own, rigid | official, rigid "
-            f"| {' | '.join(scenarios)} |",
-            "|---|---|---|---" + "|---" * len(scenarios) + "|",
-            *rows,
-            *["", f"Each doubling of the trials adds, rigid: {', '.join(curves)}."][
-                : 2 * bool(curves)
-            ],
-        ]
-    )
-    if options.write:
-        name = f"{options.models[0]}_unseen.md" if other else "intuition_networks.md"
-        (RESULTS / name).write_text(text + "\n")
+    lines = [
+        f"`python benchmarks/models/train_intuition.py FOLDER --models {name}{given} --write`, "
+        f"{datetime.date.today()}, {device()}. {len(asked['trial'])} official stimuli."
+        + " The training began from weights that may have seen these own trials, also those that "
+        "are held out." * bool(options.start),
+        "",
+        f"| model | trials per scenario | own, rigid | official, rigid | {' | '.join(scenarios)} |",
+        "|---|---|---|---" + "|---" * len(scenarios) + "|",
+        *rows,
+    ]
+    if options.counts:
+        rise = slope([*options.counts, most], [*rigid, learner.rigid(answers)])
+        lines += ["", f"Each doubling of the trials adds, rigid: {rise:+.3f}."]
+    return name if not groups and not rigid else f"{most} trials per scenario", "\n".join(lines)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,9 @@
 """Speed of the vision models, and what they have learned of movies that they were not trained on.
 
     OMP_NUM_THREADS=1 python benchmarks/models/vision_models.py speed --write  # seconds a clip
+    OMP_NUM_THREADS=1 python benchmarks/models/vision_models.py answers --write  # of intuition
     OMP_NUM_THREADS=1 python benchmarks/models/vision_models.py longest --write  # memory of *full*
+    OMP_NUM_THREADS=1 python benchmarks/models/vision_models.py answers --write  # of intuition
     python benchmarks/models/vision_models.py learn FOLDER --write  # after trainings
     python benchmarks/models/vision_models.py shipped FOLDER --write  # shipped weights
 
@@ -11,8 +13,13 @@ it times a training step of the dynamics on stored features. Times are processor
 elapsed time on a GPU (``--accelerator cuda``, also with ``--precision bf16-mixed``), where batches
 are 16 times as large.
 
+``answers`` times predictions of models of intuition from masks or pictures in memory, of moving
+boxes too.
+
 ``longest`` encodes random pictures, as many as *full* reads of the longest movies, 602 frames, each
 model in a process of its own, and prints the memory of that process before and at most.
+
+``answers`` times predictions of the models of intuition from such masks and pictures in memory.
 
 ``learn`` needs the trials of ``physion generate FOLDER --width 64 --height 64`` with the splits
 training and testing. It trains the small models with three seeds and prints, for one clip of every
@@ -85,6 +92,16 @@ DYNAMICS = tuple(name for name in METRICS if name not in SHIPPED)
 """Models of which the dynamics are trained alone."""
 ENCODERS = ("pVGG-mlp", "pDeIT-mlp", "pEffNetLite0-mlp")
 """Frozen encoders whose speed is measured, with a training step of the dynamics."""
+INTUITION = ("intuition-masks", "intuition-pixels")
+"""Models of which the speed of predictions is measured."""
+BOXES = 6
+"""Objects of a clip that is predicted."""
+ANSWERED = 50
+"""Clips that are predicted together."""
+INTUITION = ("intuition-masks", "intuition-pixels")
+"""Models whose predictions are timed."""
+ANSWERED = 50
+"""Clips that are predicted together."""
 SIZES = ("small", "paper")
 MODELS: tuple[tuple[str, dict[str, Any], int], ...] = (
     ("cswm", {}, 8),
@@ -120,12 +137,17 @@ def random_clips(clips: int, frames: int, spec: Spec) -> Batch:
     part = np.linspace(0, 1, frames)[None, :, None, None]
     centers = ends[0] + part * (ends[1] - ends[0])
     boxes = np.concatenate([centers - 0.1, centers + 0.1], -1).astype(np.float32)
+    side = (np.arange(spec.image_size) + 0.5) / spec.image_size
+    inside = (side > boxes[..., :2, None]) & (side < boxes[..., 2:, None])
+    numbers = np.arange(1, spec.objects + 1, dtype=np.uint8)[:, None, None]
+    shown = (inside[..., 1, :, None] & inside[..., 0, None, :]) * numbers
     return Batch(
         tuple(f"clip_{row}" for row in range(clips)),
         np.tile(np.arange(frames), (clips, 1)),
         np.ones((clips, frames), np.bool_),
         future=FUTURE,
         rgb=rng.integers(0, 256, shape, np.uint8),
+        ids=shown.max(2) if "ids" in spec.inputs else None,
         boxes=boxes if "boxes" in spec.inputs else None,
     ).to("cpu")
 
@@ -171,6 +193,19 @@ def longest(names: list[str]) -> Rows:
         if name in names and "backbone" not in options:
             with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
                 yield pool.submit(encode_longest, name, options).result()
+
+
+@torch.no_grad()
+def answers(names: list[str], repeats: int) -> Rows:
+    """Yield name, pictures, frames, networks, the least time of 1,000 predictions of each model."""
+    for name in names:
+        model: Any = build_model(name)
+        clips = random_clips(ANSWERED, model.spec.context, model.spec)
+        frames = torch.tensor(model.spec.context_frames()).repeat(ANSWERED, 1)
+        clips = dataclasses.replace(clips, frames=frames)
+        seconds = best_time(lambda model=model, clips=clips: model.predict(clips), repeats, "cpu")
+        cells = [model.name, f"{model.spec.image_size} px", str(model.spec.context)]
+        yield [*cells, str(model.settings.members), f"{seconds * 1000 / ANSWERED:.1f}"]
 
 
 @torch.no_grad()
@@ -335,21 +370,21 @@ def table(head: list[str], rows: Rows) -> str:
     return markdown_table(head, lines)
 
 
-def write_section(title: str, text: str) -> None:
-    """Replace a section of the results, or append it."""
-    known = RESULTS.read_text() if RESULTS.is_file() else "# Vision models\n"
+def write_section(path: Path, title: str, text: str) -> None:
+    """Replace a section of a page, or append it."""
+    known = path.read_text()
     known = re.sub(rf"\n## {re.escape(title)}\n.*?(?=\n## |\Z)", "", known, flags=re.DOTALL)
-    where = f"{datetime.date.today()}, {processor()}, torch {torch.__version__}"
-    threads = f"{torch.get_num_threads()} thread(s), load {os.getloadavg()[0]:.1f}"
-    RESULTS.write_text(f"{known.rstrip()}\n\n## {title}\n{text}\n\n{where}, {threads}.\n")
+    path.write_text(f"{known.rstrip()}\n\n## {title}\n{text}\n")
 
 
 def main() -> None:
     """Run one part."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("part", choices=("speed", "longest", "learn", "shipped"))
+    parser.add_argument("part", choices=("speed", "longest", "answers", "learn", "shipped"))
     parser.add_argument("folder", nargs="?", type=Path)
-    parser.add_argument("--models", nargs="+", default=(), choices=sorted({*METRICS, *ENCODERS}))
+    parser.add_argument(
+        "--models", nargs="+", default=(), choices=sorted({*METRICS, *ENCODERS, *INTUITION})
+    )
     parser.add_argument("--steps", type=int, default=0, help="0: those of the model")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--repeats", type=int, default=3)
@@ -361,6 +396,7 @@ def main() -> None:
     options = parser.parse_args()
     both = (*SHIPPED, *ENCODERS)
     known = {"speed": both, "longest": both, "learn": tuple(METRICS), "shipped": SHIPPED}
+    known["answers"] = INTUITION
     models = list(options.models or known.get(options.part, ()))
     if unknown := set(models).difference(known.get(options.part, ())):
         parser.error(f"{options.part} has no model {', '.join(sorted(unknown))}")
@@ -376,6 +412,10 @@ def main() -> None:
         head = ["model", "frames", "features", "before, MB", "at most, MB"]
         title = f"Memory of the features of a movie of {LONGEST} frames"
         rows = longest(models)
+    elif options.part == "answers":
+        head = ["model", "pictures", "frames", "networks", "1,000 predictions, s"]
+        title = "Processor time of predictions"
+        rows = answers(models, options.repeats)
     elif options.folder is None:
         parser.error(f"{options.part} needs the folder of the trials")
     elif options.part == "learn":
@@ -390,7 +430,9 @@ def main() -> None:
     text = table(head, rows)
     print(text)
     if options.write:
-        write_section(title, text)
+        where = f"{datetime.date.today()}, {processor()}, torch {torch.__version__}"
+        threads = f"{torch.get_num_threads()} thread(s), load {os.getloadavg()[0]:.1f}"
+        write_section(RESULTS, title, f"{text}\n\n{where}, {threads}.")
 
 
 if __name__ == "__main__":
