@@ -7,7 +7,7 @@
 Forests on what `state-trees`, `mask-trees` and `blob-trees` see are fitted on the own trials of
 FOLDER, one per scenario, and tested on the official stimuli that people saw, without those that
 show a contact in the observed part, without those of Roll with a ledge, as in the study, and
-without Drape, since simulations of cloth are slow. Five tables:
+without Drape, since simulations of cloth are slow. Tables:
 
 1. Accuracy by number of own trials per scenario, and how much a doubling adds.
 2. Accuracy, r with people and r beyond the outcome: with all trials; without trials of the tested
@@ -21,6 +21,7 @@ without Drape, since simulations of cloth are slow. Five tables:
 3. What the best model could reach, from halves of the people, and the weights of mixtures.
 4. Differences of likeness beyond the outcome between learned and simulated answers, paired over
    stimuli.
+5. With --predictions, which say how our engine ends: the same for the stimuli that end as recorded.
 
 With --write they are written to ``results/intuition.md``.
 """
@@ -52,7 +53,7 @@ from intuition_controls import (
     weighted,
     with_spread,
 )
-from intuition_trials import load, predicted, simulated
+from intuition_trials import ended_as_recorded, kinds, load, predicted, simulated
 from physion.analysis.tables import MEAN, POOLED, read_humans
 from physion.compute.tasks import processor
 from physion.core.names import RIGID
@@ -87,8 +88,8 @@ EDGES = (0.025, 0.975)
 class Trials:
     """Features and outcomes of own trials and of official stimuli, by model and scenario.
 
-    - ``own``: table by trial with ``scenario``, ``configuration`` (without number), ``contact``,
-      and ``scene``, in the order in which they were made.
+    - ``own``: table by trial with ``scenario``, ``configuration`` (without number), its ``kind``
+      (`intuition_trials.kinds`), ``contact``, and ``scene``, in the order in which they were made.
     - ``tested``: the same of official stimuli, by stimulus, with their recorded outcome; stimuli
       that show a contact in the observed part are left out, and scenarios without an own trial.
     """
@@ -126,7 +127,8 @@ class Trials:
         most
             Own trials of a scenario that forests are fitted on; None: all.
         unseen
-            Whether a stimulus is answered by a forest without the trials of its configuration.
+            Whether a stimulus is answered by a forest without the trials of its configuration, and
+            of those that differ from it in room and scenery only.
         fit, test
             Which features are used for the fit, and in the test.
         """
@@ -137,11 +139,9 @@ class Trials:
             own = self.own.loc[trials[:most]]
             of_fit, of_test = fit(own_values[:most], states), test(test_values, states)
             labels = own["contact"].to_numpy(bool)
-            groups = rows["configuration"].to_numpy() if unseen else np.full(len(rows), "")
+            groups = rows["kind"].to_numpy() if unseen else np.full(len(rows), "")
             for group in np.unique(groups):
-                kept = (
-                    own["configuration"].to_numpy() != group if unseen else np.full(len(own), True)
-                )
+                kept = own["kind"].to_numpy() != group if unseen else np.full(len(own), True)
                 forest = fit_forest(of_fit[kept], labels[kept])
                 answers[rows.index[groups == group]] = forest.probability(of_test[groups == group])
         return answers
@@ -197,6 +197,8 @@ def _facts(loaded: dict[str, NDArray[Any]]) -> pd.DataFrame:
     names = [str(trial) for trial in loaded["trial"]]
     table = pd.DataFrame({name: loaded[name] for name in columns}, index=names)
     table["configuration"] = table["configuration"].astype(str).str.removesuffix("_2")
+    pairs = zip(table["scenario"], table["configuration"], strict=True)
+    table["kind"] = [kinds(str(scenario)).get(name, name) for scenario, name in pairs]
     return table
 
 
@@ -269,16 +271,42 @@ def likeness_rows(
     return rows
 
 
-def difference_rows(trials: Trials, answers: dict[str, pd.Series]) -> list[str]:
+def engine_rows(trials: Trials, answers: dict[str, pd.Series], same: pd.Series) -> list[str]:
+    """Return rows of answers where our engine ends as recorded (``same``, by stimulus).
+
+    Accuracy by outcomes of our engine, for all stimuli; for the ones that end as recorded:
+    accuracy, r with people, and r beyond the outcome, pooled.
+    """
+    contact = trials.tested["contact"].astype(bool)
+    people = answers_of_people(trials)
+    yes, rows = (people["yes"] / people["count"])[same], []
+    for name, p in answers.items():
+        right = (p > 0.5) == (contact == same)
+        means = [
+            one.groupby(trials.tested["scenario"][one.index]).mean().mean()
+            for one in (right, right[same])
+        ]
+        beyond = partial(p[same].to_numpy(), yes.to_numpy(), contact[same].to_numpy())
+        cells = [*means, float(np.corrcoef(p[same], yes)[0, 1]), beyond]
+        rows.append(f"| {name} | {' | '.join(f'{cell:.3f}' for cell in cells)} |")
+        print(rows[-1], flush=True)
+    return rows
+
+
+def difference_rows(
+    trials: Trials, answers: dict[str, pd.Series], kept: pd.Series | None = None
+) -> list[str]:
     """Return rows of the difference of r beyond the outcome, learned less simulated.
 
-    Intervals are of 2000 samples of the stimuli with replacement, the same for both.
+    Intervals are of 2000 samples of the stimuli (``kept``, by stimulus, or all) with replacement,
+    the same for both.
     """
     people = answers_of_people(trials)
     outcome = trials.tested["contact"].to_numpy(bool)
     yes = (people["yes"] / people["count"]).to_numpy()
-    draws = np.random.default_rng(0).integers(len(yes), size=(2000, len(yes)))
-    everything, rows = np.arange(len(yes)), []
+    everything = np.arange(len(yes)) if kept is None else np.flatnonzero(kept)
+    places = np.random.default_rng(0).integers(len(everything), size=(2000, len(everything)))
+    draws, rows = everything[places], []
     learned_names = [n for n in answers if n.startswith((*GIVEN.values(), "intuition"))]
     for learned in (n for n in learned_names if "spread" not in n and "exchanged" not in n):
         for other in (name for name in answers if name in COMPARED):
@@ -344,7 +372,10 @@ def main() -> None:
             )
     given_answers: dict[str, pd.Series] = {}
     for path in options.predictions:
-        given_answers |= {name: p[trials.tested.index] for name, p in predicted(path).items()}
+        table = {name: p[trials.tested.index] for name, p in predicted(path).items()}
+        if twice := set(table) & set(given_answers):
+            raise SystemExit(f"--predictions has two tables of {', '.join(sorted(twice))}")
+        given_answers |= table
     answers |= given_answers
     answers["base rate of the configuration"] = trials.base_rates()
     scenes = trials.tested["scene"].to_dict()
@@ -399,6 +430,30 @@ def main() -> None:
     answers |= mixed_own
     rows = likeness_rows(trials, answers, scored(answers))
     differences = difference_rows(trials, answers)
+    engine = []
+    if options.predictions:
+        same = ended_as_recorded(options.predictions[0])[trials.tested.index]
+        chosen = {
+            name: p for name, p in answers.items()
+            if name in (*GIVEN.values(), *learned)
+            or (name.startswith("simulation") and "spread" not in name)
+        }  # fmt: skip
+        engine = [
+            "",
+            f"The stimuli that end with our engine as recorded: {int(same.sum())} of {len(same)}. "
+            "*By our engine*: accuracy by its outcomes, of all stimuli. The other columns are of "
+            "these stimuli; accuracies are means of the seven rigid scenarios, r is pooled:",
+            "",
+            "| answers | by our engine | accuracy | r | r beyond the outcome |",
+            "|---|---|---|---|---|",
+            *engine_rows(trials, chosen, same),
+            "",
+            "Difference of r beyond the outcome, pooled, of these stimuli:",
+            "",
+            "| learned | simulated | difference |",
+            "|---|---|---|",
+            *difference_rows(trials, answers, same),
+        ]
     reliability, most = ceiling(people, outcome)
     print(f"reliability {reliability:.3f}, ceiling {most:.3f}", flush=True)
     counts = trials.own.groupby("scenario").size()
@@ -447,6 +502,7 @@ def main() -> None:
             "| learned | simulated | difference |",
             "|---|---|---|",
             *differences,
+            *engine,
         ]
     )
     if options.write:

@@ -22,7 +22,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -330,6 +330,29 @@ def predicted(path: Path) -> dict[str, pd.Series]:
         str(model): rows.set_index("stimulus")["p_contact"]
         for model, rows in table.groupby("model")
     }
+
+
+def ended_as_recorded(path: Path) -> pd.Series:
+    """Return, by stimulus, whether it ends as recorded with the engine that made the trials."""
+    table = pd.read_csv(path).drop_duplicates("stimulus")
+    names = table["stimulus"].map(canonical_name)
+    return pd.Series((table["outcome"] == table["recorded_outcome"]).to_numpy(), names)
+
+
+@cache
+def kinds(scenario: str) -> Mapping[str, str]:
+    """Return the kind of every configuration: the first that differs in room and scenery only.
+
+    Names of configurations are those of presets, or official ones where there are some.
+    """
+    first: dict[str, str] = {}
+    found = {}
+    for preset in load_presets(scenario).values():
+        given = preset.params
+        names = [field.name for field in fields(given) if field.name not in ("room", "scenery")]
+        name = (preset.official or preset.name).removesuffix("_2")
+        found[name] = first.setdefault(repr([getattr(given, name) for name in names]), name)
+    return found
 
 
 def names_stored(folder: Path) -> list[str]:

@@ -67,6 +67,8 @@ TESTED = ("official", "own")
 SIMULATED = "observed+simulated"
 LEVEL = 0.05
 NOT_COMPUTED = "not computed"
+NEITHER = "neither"
+"""Verdict where the difference is significant neither there nor here."""
 ACROSS = "trained on another scenario"
 MORE = (
     *(
@@ -87,7 +89,7 @@ MORE = (
     ),
     Claim(
         "particle and vision models",
-        "No vision model comes near the models that are given particles",
+        "Models that are given particles are right more often than vision models, on average",
         {},
         Contrast("particle against vision models", (*VISION, *PARTICLES), high=PARTICLES,
                  groups=("scenario", "training"), readouts=(SIMULATED,)),
@@ -290,7 +292,7 @@ def verdict(paper: Mapping[str, Any], ours: Mapping[str, Any], null: float) -> s
         return "same" if same else "opposite"
     if known != shown:
         return "not shown here" if known else "shown only here"
-    return "same"
+    return NEITHER
 
 
 def words(fit: Mapping[str, Any], *, models: bool) -> str:

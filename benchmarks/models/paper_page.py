@@ -29,6 +29,7 @@ from PIL import Image
 from paper_claims import (
     GENERALISED,
     NAMES,
+    NEITHER,
     NOT_COMPUTED,
     RESULTS,
     SIMULATED,
@@ -402,11 +403,13 @@ def page_text(
         _trained(parts, tested),
         "",
         "## What does not come out the same",
-        "Claims whose test has another sign than in the released tables, or is significant "
-        "(p < .05) in one of the two only. *Not shown here* is no refutation: the models are "
-        "small, and fewer. Rows of one model and scenario share their stimuli, which these tests "
-        "do not know, so that their p are too small, there and here. Claims about people only are "
-        "those of `physion compare --published`.",
+        "Claims whose test is significant (p < .05) in the released tables and here, with another "
+        "sign, or in one of the two only. *Neither*: in none of the two, whatever the signs. *Not "
+        "shown here* is no refutation: the models are small, and fewer. Rows of one model and "
+        "scenario share their stimuli, which these tests do not know, so that their p are too "
+        "small, there and here. Encoders of ImageNet are frozen: under *observed* and *full* their "
+        "rows are the same with mlp and lstm and under all protocols, which makes differences of "
+        "protocols smaller. Claims about people only are those of `physion compare --published`.",
         "",
         *(differ or ["Nothing of what was computed."]),
         "",
@@ -440,9 +443,12 @@ def page_text(
 
 def _counted(name: str, verdicts: pd.Series) -> str:
     """Return how many claims come out the same, as a line of a list."""
-    known = verdicts[verdicts.isin(["same", *DIFFERENT])]
-    same = int((known == "same").sum())
-    return f"- {name[0].upper()}{name[1:]}: {same} of {len(known)} claims come out the same."
+    known = verdicts[verdicts.isin(["same", NEITHER, *DIFFERENT])]
+    same, neither = (int((known == verdict).sum()) for verdict in ("same", NEITHER))
+    return (
+        f"- {name[0].upper()}{name[1:]}: {same} of {len(known)} claims come out the same, and "
+        f"{neither} are significant in neither."
+    )
 
 
 def _wrapped(line: str) -> str:

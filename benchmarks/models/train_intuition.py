@@ -36,7 +36,7 @@ import torch
 from numpy.typing import NDArray
 
 from intuition_controls import slope
-from intuition_trials import load, names_stored
+from intuition_trials import kinds, load, names_stored
 from physion.clips.batch import Batch, Spec
 from physion.compute.tasks import processor
 from physion.core.files import digest_of
@@ -229,8 +229,13 @@ class Learner:
         ]
         rigid = [one.drop("drape", errors="ignore").mean() for one in scores]
         each = " | ".join(f"{value:.2f}" for value in scores[1])
-        fit = trials or int((~self.held).sum() / len(scores[0]))
+        fit = trials or self.trials_per_scenario()
         return f"| {name} | {fit} | {rigid[0]:.3f} | {rigid[1]:.3f} | {each} |"
+
+    def trials_per_scenario(self) -> int:
+        """Return the mean number of training trials of a rigid scenario."""
+        fit = self.own["scenario"][~self.held & (self.own["scenario"] != "drape")]
+        return int(len(fit) / len(np.unique(fit)))
 
     def keep(self, name: str, answers: NDArray[np.float64]) -> None:
         """Write predictions of official stimuli."""
@@ -267,9 +272,13 @@ def device() -> str:
 
 
 def _configurations(made: Mapping[str, NDArray[Any]]) -> list[tuple[str, str]]:
-    """Return scenario and configuration of trials; one with _2 at its end is a second name."""
+    """Return scenario and kind of configuration of trials (`intuition_trials.kinds`).
+
+    A name with _2 at its end is a second name.
+    """
     names = (str(name).removesuffix("_2") for name in made["configuration"])
-    return list(zip(made["scenario"].tolist(), names, strict=True))
+    pairs = zip(made["scenario"].tolist(), names, strict=True)
+    return [(scenario, kinds(scenario).get(name, name)) for scenario, name in pairs]
 
 
 def _flat(values: NDArray[Any]) -> NDArray[Any]:
@@ -346,7 +355,7 @@ def section(learner: Learner) -> tuple[str, str]:
     fit = pd.Series(own["scenario"][~learner.held]).value_counts()
     if max(options.counts, default=0) > fit.min():
         raise SystemExit(f"--counts: some scenario has only {fit.min()} trials for training")
-    most = int((~learner.held).sum() / len(np.unique(own["scenario"])))
+    most = learner.trials_per_scenario()
     rigid = []
     for count in options.counts:
         found = learner.train(f"first_{count}", learner.number < count)

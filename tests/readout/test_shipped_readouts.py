@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -220,3 +221,20 @@ def test_own_trials_are_fitted_where_there_are_as_many(
     assert unlike_shipped(other, spec, rendered=True) == ["a frame rate of 100.0/s, not 30/s"]
     assert not unlike_shipped(other, build_model("state-trees").spec, rendered=False)
     assert not unlike_shipped(index, replace(spec, image_size=128), rendered=True)
+
+
+def test_trials_unlike_those_of_a_pretrained_model_are_refused_or_said(tmp_path: Path) -> None:
+    make_dots(tmp_path / "dots", {"testing": 2}, ("drop",))
+    index = Dataset(tmp_path / "dots").index
+    pixels = partial(evaluate, "intuition-pixels", tmp_path / "dots", tmp_path / "out")
+    write_index(tmp_path / "dots", index.assign(look="free"))
+    with pytest.raises(BadInputError, match=r"in the look redyellow, .* free; .* cue=true"):
+        pixels()
+    assert pixels(options={"cue": True}, dry_run=True).evaluated
+    write_index(tmp_path / "dots", index.assign(look="redyellow"))
+    (words,) = pixels().warnings
+    assert "predictions may be wrong: stored movies of 64 x 64 pixels, and the model sees" in words
+    oblong, _ = unlike_shipped(
+        index.assign(width=128), build_model("intuition-pixels").spec, rendered=False
+    )
+    assert oblong == "movies of 128 x 64 pixels, which are squeezed to squares"

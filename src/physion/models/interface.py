@@ -226,6 +226,9 @@ class Model:
         Optimiser and schedule of its training.
     calibration_trials
         Largest number of training trials that `calibrate` is given.
+    look
+        Colours that trials must have, ``redyellow`` or ``free``; empty: any. Where it is set, an
+        evaluation warns of movies of another rate, size or shape.
     """
 
     spec: Spec
@@ -242,6 +245,7 @@ class Model:
     window: int = 0
     training_settings: TrainingSettings = TrainingSettings()
     calibration_trials: int = 0
+    look: str = ""
 
     def provenance(self) -> Provenance:
         """Return name, weights and versions for the table of predictions."""

@@ -5,9 +5,9 @@ many trials and how they ended. An object is a token, which holds its track over
 2, 5, ..., 44, from the true state (`intuition-states`), from its true mask (`intuition-masks`), or
 from the mask that a network finds in pictures (`intuition-pixels`, `physion.models.segmentation`):
 
-    x_k = f(track_k, track_k - track_agent, track_k - track_patient, d track_k, constants_k),
+    x_k = f(track_k, place_k - place_agent, place_k - place_patient, d track_k, constants_k),
 
-and L blocks of attention over the objects, in no order, lead to the answer
+where places are a part of the track (`VIEWS`), and L blocks of attention over the objects, in no order, lead to the answer
 
     P(contact) = sigmoid( g(x_agent, x_patient, mean_k x_k) ).
 
@@ -526,6 +526,7 @@ class Intuition(TorchModel):
             stride=STRIDE, context=CONTEXT, future=0, framewise=False,
         )  # fmt: skip
         self.view = VIEWS[self.kind]
+        self.look = "redyellow" if self.kind == PIXELS and not settings.cue else ""
         readings = READINGS[self.kind]
         self.readings = [readings[n % len(readings)] for n in range(settings.members)]
         with initial_weights(settings.model, settings.seed):
@@ -602,7 +603,7 @@ class Intuition(TorchModel):
 
     def notes(self, batch: Batch) -> list[str]:
         """Return for each trial whether it never shows agent or patient, or too many objects."""
-        most, notes = self.settings.objects, []
+        notes = []
         ids = None if self.kind == STATE else self._ids(batch)
         unseen = "agent or patient never visible"
         if self.kind == PIXELS:
@@ -610,9 +611,10 @@ class Intuition(TorchModel):
         if self.settings.cue:
             unseen = "agent or patient not visible in the first frame"
         if ids is not None:
-            tokens = np.stack([mask_tokens(one, most) for one in ids])
+            tokens = np.stack([mask_tokens(one, self.settings.objects) for one in ids])
             batch = replace(batch, features=torch.from_numpy(tokens).flatten(2).to(self.device))
-        for seen, count in zip(self.seen(batch).tolist(), self._counts(batch, ids), strict=True):
+        counts = self._counts(batch, ids)
+        for seen, (count, most) in zip(self.seen(batch).tolist(), counts, strict=True):
             hidden = "" if seen else f"{unseen}: base rate"
             many = f"{count} objects, only {most} are looked at" if count > most else ""
             notes.append("; ".join(filter(None, (hidden, many))))
@@ -758,11 +760,17 @@ class Intuition(TorchModel):
         cues = [of[0] for of in seen["ids"]] if self.settings.cue else [None] * len(seen["rgb"])
         return np.stack([segment(shown, cue) for shown, cue in zip(seen["rgb"], cues, strict=True)])
 
-    def _counts(self, batch: Batch, ids: NDArray[np.uint8] | None) -> Sequence[int]:
-        """Return the number of objects of every clip, which may be more than there are tokens."""
+    def _counts(self, batch: Batch, ids: NDArray[np.uint8] | None) -> Sequence[tuple[int, int]]:
+        """Return how many objects every clip has, and how many at most are looked at."""
+        most = self.settings.objects
         if ids is not None:
-            return [len(np.unique(one[one > 0])) for one in ids]
+            return [(len(np.unique(one[one > 0])), most) for one in ids]
         scenes = [motion.scene for motion in motions(batch, self.name)]
+        # The third token is the probe's, and empty without one (`_nearest`).
         return [
-            sum(not body.scenery for body in scene.bodies) + len(scene.cloths) for scene in scenes
+            (
+                sum(not body.scenery for body in scene.bodies) + len(scene.cloths),
+                most - (most > 2 and _probe(scene) < 0),
+            )
+            for scene in scenes
         ]

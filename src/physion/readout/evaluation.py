@@ -286,6 +286,14 @@ class _Evaluate:
             provenance = dataclasses.replace(provenance, model=name)
         if not provenance.inputs:
             provenance = dataclasses.replace(provenance, inputs=", ".join(model.spec.inputs))
+        looks = self._looks()
+        if (look := ask(model, "look")) and looks != {look}:
+            raise BadInputError(
+                f"{provenance.model} looks for agent and patient in the look {look}, and the "
+                f"tested trials have {' and '.join(sorted(looks))}; make trials with --look {look}"
+                + ", or add --option cue=true"
+                * hasattr(model.settings, "cue")
+            )
         shipped = None if rules.together else self._shipped(model)
         path = self._table(cell, model, training, provenance, ways, shipped, rules)
         errors_path = self.out / "rollout-errors" / path.name if settings.rollout_errors else None
@@ -389,21 +397,25 @@ class _Evaluate:
     def _warnings(
         self, model: Model, splits: Sequence[ScenarioSplit], readouts: Sequence[Readout]
     ) -> tuple[str, ...]:
-        """Return what to say of the readouts that ship, if some would be used for ``readouts``."""
+        """Return what to say of trials that differ from those of the weights or readouts that ship.
+
+        Of readouts only if some would be used for ``readouts``.
+        """
+        name, rendered = model.provenance().model, self.settings.rendered
+        unlike = unlike_shipped(self.dataset.index, model.spec, rendered=rendered)
+        if ask(model, "look"):
+            return tuple(f"{name}: predictions may be wrong: {words}" for words in unlike)
         offered = self._offered(model)
         if offered is None:
             return ()
         pairs = [(offered.find(one, split.scenario), split) for one in readouts for split in splits]
         if not any(known and known.fit_trials > len(split.fit) for known, split in pairs):
             return ()
-        name = model.provenance().model
         if (looks := self._looks()) != {"redyellow"}:
             return (
                 f"{name}: the readouts that ship are for red and yellow trials and are not used, "
                 f"since the look of the tested ones is {' and '.join(sorted(looks))}",
             )
-        index, rendered = self.dataset.index, self.settings.rendered
-        unlike = unlike_shipped(index, model.spec, rendered=rendered)
         return tuple(f"{name}: the readouts that ship may not fit: {words}" for words in unlike)
 
     def _table(

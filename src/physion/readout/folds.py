@@ -230,6 +230,10 @@ def unlike_shipped(index: pd.DataFrame, spec: Spec, *, rendered: bool) -> list[s
         found.append(f"a frame rate of {_listed(rates)}/s, not {PLAYBACK_RATE}/s")
     stored = "rgb" in spec.inputs and not rendered and index["movie_sha256"].notna().any()
     small = tested[tested[["width", "height"]].min(axis=1) < spec.image_size]
+    oblong = tested[tested["width"] != tested["height"]]
+    if stored and len(oblong):
+        sizes = oblong["width"].astype(str) + " x " + oblong["height"].astype(str)
+        found.append(f"movies of {_listed(sizes)} pixels, which are squeezed to squares")
     if stored and len(small):
         sizes = small["width"].astype(str) + " x " + small["height"].astype(str)
         found.append(
