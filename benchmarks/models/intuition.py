@@ -11,13 +11,13 @@ without Drape, since simulations of cloth are slow. Tables:
 
 1. Accuracy by number of own trials per scenario, and how much a doubling adds.
 2. Accuracy, r with people and r beyond the outcome: with all trials; without trials of the tested
-   configuration, or of the tested scenario; with the controls of `intuition_controls`; noisy
-   simulation from the true state; mixtures of both, with weights fitted on own trials or, where the
-   name says so, to people's answers to one half of the stimuli, and tested on the other half;
-   predictions of other models (--predictions FILE); answers that have the values of another, by
-   rank; levels of noise fitted to people in the same way; each network of intuition with the
-   forests that are given the same; forests, networks of intuition and levels of noise together,
-   with equal weights and with weights fitted to people.
+   configuration, of its kind (all that differ in room and scenery only), or of its scenario; with
+   the controls of `intuition_controls`; noisy simulation from the true state; mixtures of both,
+   with weights fitted on own trials or, where the name says so, to people's answers to one half of
+   the stimuli, and tested on the other half; predictions of other models (--predictions FILE);
+   answers that have the values of another, by rank; levels of noise fitted to people in the same
+   way; each network of intuition with the forests that are given the same; forests, networks of
+   intuition and levels of noise together, with equal weights and with weights fitted to people.
 3. What the best model could reach, from halves of the people, and the weights of mixtures.
 4. Differences of likeness beyond the outcome between learned and simulated answers, paired over
    stimuli.
@@ -114,7 +114,7 @@ class Trials:
         name: str,
         most: int | None = None,
         *,
-        unseen: bool = False,
+        unseen: str = "",
         fit: Columns = every,
         test: Columns = every,
     ) -> pd.Series:
@@ -127,8 +127,8 @@ class Trials:
         most
             Own trials of a scenario that forests are fitted on; None: all.
         unseen
-            Whether a stimulus is answered by a forest without the trials of its configuration, and
-            of those that differ from it in room and scenery only.
+            ``configuration`` or ``kind``: a stimulus is answered by a forest without the trials of
+            its configuration, or without those of all that differ from it in room and scenery only.
         fit, test
             Which features are used for the fit, and in the test.
         """
@@ -139,9 +139,9 @@ class Trials:
             own = self.own.loc[trials[:most]]
             of_fit, of_test = fit(own_values[:most], states), test(test_values, states)
             labels = own["contact"].to_numpy(bool)
-            groups = rows["kind"].to_numpy() if unseen else np.full(len(rows), "")
+            groups = rows[unseen].to_numpy() if unseen else np.full(len(rows), "")
             for group in np.unique(groups):
-                kept = own["kind"].to_numpy() != group if unseen else np.full(len(own), True)
+                kept = own[unseen].to_numpy() != group if unseen else np.full(len(own), True)
                 forest = fit_forest(of_fit[kept], labels[kept])
                 answers[rows.index[groups == group]] = forest.probability(of_test[groups == group])
         return answers
@@ -364,7 +364,8 @@ def main() -> None:
     answers: dict[str, pd.Series] = {}
     for name, given in GIVEN.items():
         answers[given] = trials.predict(name)
-        answers[f"{given}, configuration unseen"] = trials.predict(name, unseen=True)
+        answers[f"{given}, configuration unseen"] = trials.predict(name, unseen="configuration")
+        answers[f"{given}, kind of configuration unseen"] = trials.predict(name, unseen="kind")
         answers[f"{given}, scenario unseen"] = trials.predict_elsewhere(name)
         for control in CONTROLS:
             answers[f"{given}, {control.name}"] = trials.predict(

@@ -12,10 +12,10 @@ trials. Predictions of official stimuli go to FOLDER/predictions, where
 ``intuition.py --predictions`` reads them, weights to FOLDER/training. --weights names a folder for
 the weights of all scenarios as float16.
 Other trainings answer what a network has to have seen: --counts, the first trials of each scenario
-only; --unseen, without the configuration of the tested trial (`FOLDS` trainings, each without a
-part of the configurations); --all-but, without its scenario. With --write the table is written to
-``results/intuition_networks.md``, with these trainings to ``results/MODEL_unseen.md``, of one model
-at a time.
+only; --unseen, without the configuration of the tested trial and those that differ from it in room
+and scenery only (`FOLDS` trainings, each without a part of these kinds); --all-but, without its
+scenario. With --write the section of each model in ``results/intuition_networks.md`` is replaced,
+with these trainings a section of ``results/MODEL_unseen.md``, of one model at a time.
 """
 
 from __future__ import annotations
@@ -364,11 +364,11 @@ def section(learner: Learner) -> tuple[str, str]:
         add(learner.row(f"{name}, {count} trials", found, count))
     groups: dict[str, Sequence[NDArray[Any]]] = {}
     if options.unseen:
-        groups["configuration"] = learner.configurations()
+        groups["kind of configuration"] = learner.configurations()
     if options.all_but:
         groups["scenario"] = own["scenario"], asked["scenario"]
     for what, (own_groups, asked_groups) in groups.items():
-        short = "fold" if what == "configuration" else "no"
+        short = "no" if what == "scenario" else "fold"
         found = learner.train_apart(short, own_groups, asked_groups)
         learner.keep(f"{name}, {what} unseen", found["official"])
         add(learner.row(f"{name}, {what} unseen", found))
