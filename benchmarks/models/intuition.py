@@ -405,7 +405,7 @@ def main() -> None:
     answers["simulation, level fitted to people"] = best_level(every_level, people, scenario)
     answers["simulation, levels weighted to people"] = weighted(every_level, people, scenario)
     default, weights = answers[str(levels.columns[0])], []
-    learned = [name for name in given_answers if name.startswith("intuition")]
+    learned = [n for n in given_answers if n.startswith("intuition") and "," not in n]
     for given in (*GIVEN.values(), *learned):
         answers[f"{given}, spread of simulation"] = with_spread(answers[given], default, scenario)
         answers[f"simulation, spread of {given}"] = with_spread(default, answers[given], scenario)

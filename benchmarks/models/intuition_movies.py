@@ -4,11 +4,11 @@
 
 FOLDER is the one of `intuition.py`, run with ``--many 200``: its simulations are taken. PREDICTIONS
 is a table of `physion evaluate`, of one model on the official stimuli. From stimuli without a
-contact in the observed part, the ones with the largest difference of P(contact) are drawn, at most
-one per scenario: ``--each`` on which people are nearer to the model, and as many on which they are
-nearer to simulation. OUT gets a movie of each, up to the end of the trial as our engine simulates
-it. --write writes the table, and a picture with frames 0, 22 and 44 and the last one, to
-``results/intuition_movies``.
+contact in the observed part, which end with our engine as recorded, the ones with the largest
+difference of P(contact) are drawn: ``--each`` on which people are nearer to the model, at most one
+per scenario, and as many on which they are nearer to simulation. OUT gets a movie of each, up to
+the end of the trial as our engine simulates it. --write writes the table, and a picture with frames
+0, 22 and 44 and the last one, to ``results/intuition_movies``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from PIL import Image
 
-from intuition_trials import load, predicted, simulated
+from intuition_trials import ended_as_recorded, load, predicted, simulated
 from physion.analysis.tables import read_humans
 from physion.clips.batch import LAST_OBSERVED
 from physion.core.names import RIGID
@@ -53,6 +53,7 @@ def differing(folder: Path, predictions: Path) -> pd.DataFrame:
     (answers,) = predicted(predictions).values()
     facts["model"] = answers.reindex(facts.index)
     facts = facts.dropna(subset="model")
+    facts["as_recorded"] = ended_as_recorded(predictions)[facts.index]
     facts["simulation"] = simulated(folder, facts["scene"].to_dict(), 1.0, SAMPLES)
     accuracy = people["accuracy"].reindex(facts.index).astype(float)
     facts["people"] = accuracy.where(facts["contact"].astype(bool), 1 - accuracy)
@@ -63,8 +64,8 @@ def differing(folder: Path, predictions: Path) -> pd.DataFrame:
 
 
 def chosen(table: pd.DataFrame, each: int) -> pd.DataFrame:
-    """Return the first stimuli of each kind, at most one per scenario."""
-    first = table.drop_duplicates(["nearer", "scenario"])
+    """Return the first stimuli of each kind that end as recorded, at most one per scenario."""
+    first = table[table["as_recorded"]].drop_duplicates(["nearer", "scenario"])
     return pd.concat(part.head(each) for _, part in first.groupby("nearer"))
 
 
@@ -104,6 +105,10 @@ def main() -> None:
         rows.append([len(rows) + 1, str(name), row["scenario"], *ends, *answers, row["nearer"]])
         print(*rows[-1], flush=True)
     heads = ("row", "stimulus", "scenario", "recorded", "our engine", "people", "model")
+    nearer = [
+        f"on {(part['nearer'] == 'model').sum()} of {len(part)}"
+        for part in (first, first[first["as_recorded"]], every, every[every["as_recorded"]])
+    ]
     text = markdown_table([*heads, "simulation", "people are nearer to"], rows)
     half = -(-len(strips) // 2)
     strips += [np.full_like(strips[0], 255)] * (2 * half - len(strips))
@@ -116,10 +121,9 @@ def main() -> None:
             f"`python benchmarks/models/intuition_movies.py FOLDER {options.predictions.name} OUT "
             f"--write`, {datetime.date.today()}. Answers are P(contact), from {SAMPLES} "
             "simulations, from the model, and as the fraction of people who say yes.\n\n"
-            f"Of the {MOST} stimuli that differ most people are nearer to the model on "
-            f"{(first['nearer'] == 'model').sum()}, of all {len(every)} on "
-            f"{(every['nearer'] == 'model').sum()}; {int(first['contact'].sum())} of the {MOST} "
-            f"end with a contact.\n\n{text}\n\n"
+            f"People are nearer to the model {nearer[0]} stimuli that differ most, {nearer[1]} of "
+            f"these that end with our engine as recorded; {nearer[2]} of all, and {nearer[3]} of "
+            f"all that end as recorded.\n\n{text}\n\n"
             "Frames 0, 22, 44 and the last one, by our engine, of each, down the left column and "
             "then the right one:\n\n![stimuli](intuition_movies.png)\n"
         )
