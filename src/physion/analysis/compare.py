@@ -103,9 +103,9 @@ def compare_everywhere(
     zone = pd.concat(zones, ignore_index=True)
     if len(measured) > 1:
         zone = pd.concat([zone, released_r_zone(zone)], ignore_index=True)
-    tables = [measure_table(one, draws.level) for one in measured]
+    tables = [measure_table(one) for one in measured]
     if len(measured) > 1:
-        tables.append(measure_table(mean_measures(measured), draws.level))
+        tables.append(measure_table(mean_measures(measured)))
     return PeopleComparison(
         scores=with_kind(_with_zone(pd.concat(tables, ignore_index=True), zone), "model"),
         zones=zone,
@@ -240,7 +240,7 @@ def all_results(
         about_people = fits_of_people(people, progress)
     pooled = pool_comparison(main)
     several = len(main.names) > 1
-    together = compare_populations(main, predictions, draws.level) if population else None
+    together = compare_populations(main, predictions) if population else None
     return ComparisonResults(
         main,
         predictions=predictions,

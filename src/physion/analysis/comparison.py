@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from physion.analysis.intervals import Bootstrap
+from physion.analysis.intervals import LEVEL, Bootstrap
 from physion.analysis.people.responses import EXCLUDED, LEDGE
 from physion.analysis.scores import baseline_scores, kind_of, people_table, score_table, with_kind
 from physion.analysis.tables import MEAN, ONLY, in_order, name_models, with_labels
@@ -186,16 +186,11 @@ def observed_contacts(predictions: pd.DataFrame) -> pd.Series:
     return known["observed_contact"].astype(bool).groupby(known["stimulus"]).any()
 
 
-def later_scores(stimuli: pd.DataFrame, level: float = 0.95) -> tuple[pd.DataFrame, str]:
+def later_scores(stimuli: pd.DataFrame) -> tuple[pd.DataFrame, str]:
     """Return the scores of models and baselines on trials without observed contact, and a sentence.
 
-    Parameters
-    ----------
-    stimuli
-        As `Comparison.stimuli`. Trials of which it is not known whether the contact was
-        observed (``observed_contact`` is None) are left out too.
-    level
-        Level of the intervals.
+    ``stimuli``: as `Comparison.stimuli`. Trials of which it is not known whether the contact was
+    observed (``observed_contact`` is None) are left out too.
 
     Returns
     -------
@@ -220,7 +215,7 @@ def later_scores(stimuli: pd.DataFrame, level: float = 0.95) -> tuple[pd.DataFra
     kept = stimuli[stimuli["stimulus"].isin(each.loc[later, "stimulus"])]
     if kept.empty:
         return pd.DataFrame(), f"{words}; none is left, so there are no scores without them"
-    parts = [with_kind(score_table(kept, level)), baseline_scores(kept, level)]
+    parts = [with_kind(score_table(kept)), baseline_scores(kept)]
     return pd.concat([part for part in parts if len(part)], ignore_index=True), words
 
 
@@ -396,19 +391,19 @@ def compare_scores(
         )
     warnings += check_outcomes(stimuli) + check_accuracy(stimuli) + check_size(stimuli)
     answered = people[people["stimulus"].isin(stimuli["stimulus"])]
-    scores = with_kind(score_table(stimuli, draws.level))
-    later, observed = later_scores(stimuli, draws.level)
+    scores = with_kind(score_table(stimuli))
+    later, observed = later_scores(stimuli)
     return Comparison(
         scores=scores,
-        baselines=baseline_scores(stimuli, draws.level).reindex(columns=scores.columns),
+        baselines=baseline_scores(stimuli).reindex(columns=scores.columns),
         later=later.reindex(columns=scores.columns),
         people=people.iloc[:0]
         if humans is None
-        else people_table(answered, _whole(zone, people, stimuli), draws.level),
+        else people_table(answered, _whole(zone, people, stimuli)),
         stimuli=stimuli,
         changed=_changed(stimuli),
         dropped=pd.concat(dropped, ignore_index=True),
-        settings=_settings(humans is not None, unwanted, exclude_ledge, draws)
+        settings=_settings(humans is not None, unwanted, exclude_ledge)
         | {SETTING: observed}
         | (_intervals_with_participants(draws) if participants else {})
         | (_describe_zone(zone, zone_origin) if humans is not None else {}),
@@ -541,7 +536,6 @@ def _settings(
     has_people: bool,
     unwanted: set[str],
     exclude_ledge: bool,
-    draws: Bootstrap,
 ) -> dict[str, str]:
     words = {
         "Stimuli": "those that people saw and the model predicts, each model on its own set; "
@@ -550,7 +544,7 @@ def _settings(
         else "all that the models predict; no people were given",
         "Roll stimuli with a ledge": "left out, as in the study" if exclude_ledge else "kept",
         "Further stimuli left out": f"{len(unwanted)} on a list" if unwanted else "none",
-        "Intervals": f"{draws.level:.0%} jackknife intervals over stimuli within each scenario: "
+        "Intervals": f"{LEVEL:.0%} jackknife intervals over stimuli within each scenario: "
         "where the score is expected with other stimuli of the same number and the same people",
         "Overall": "“mean” averages the scores of the scenarios, each counting the same; “pooled” "
         "takes all stimuli together",
@@ -564,14 +558,13 @@ def _settings(
 
 
 def _intervals_with_participants(draws: Bootstrap) -> dict[str, str]:
-    level = f"{draws.level:.0%}"
     return {
-        "Intervals with participants": f"{level} jackknife intervals, three of them: where the "
+        "Intervals with participants": f"{LEVEL:.0%} jackknife intervals, three of them: where the "
         "measure is expected with other participants, other stimuli, or both, of the same number "
         "in each scenario. The jackknife over participants is corrected for the noise of their "
         "averages (Efron and Stein, 1981); with both, the noise of single answers counts once, "
         "and not three times as in a bootstrap of both (Owen, 2007)",
-        "Intervals of people's accuracy and agreement": f"{level} percentile bootstrap over "
+        "Intervals of people's accuracy and agreement": f"{LEVEL:.0%} percentile bootstrap over "
         f"participants, as preregistered, {draws.resamples} resamples, seed {draws.seed}",
     }
 

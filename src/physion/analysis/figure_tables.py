@@ -276,9 +276,7 @@ def _halves_by_third(
 # --- readout and training -----------------------------------------------------------------------
 
 
-def effects_table(
-    comparison: Comparison, predictions: pd.DataFrame, level: float = 0.95
-) -> pd.DataFrame:
+def effects_table(comparison: Comparison, predictions: pd.DataFrame) -> pd.DataFrame:
     """Return accuracy by readout and by training protocol, averaged over seeds, then over
     scenarios.
 
@@ -300,10 +298,9 @@ def effects_table(
     order = [name for name in ("all", ALL_BUT, ONLY, ANOTHER) if name in trainings]
     order += sorted(set(trainings) - set(order))
     parts = [
-        _effect(rows[rows["training"] == training], "readout", readouts, f"by readout{words}",
-                level),
+        _effect(rows[rows["training"] == training], "readout", readouts, f"by readout{words}"),
         _effect(rows[rows["readout"] == readout], "training", order,
-                f"by training (readout {readout})", level),
+                f"by training (readout {readout})"),
     ]  # fmt: skip
     table = pd.concat([part for part in parts if len(part)] or [parts[0]], ignore_index=True)
     people = comparison.people.set_index("scenario")["accuracy"] if comparison.has_people else {}
@@ -317,9 +314,7 @@ def _most_common(values: pd.Series) -> str:
     return str(values.value_counts().index[0])
 
 
-def _effect(
-    rows: pd.DataFrame, column: str, groups: Sequence[str], panel: str, level: float
-) -> pd.DataFrame:
+def _effect(rows: pd.DataFrame, column: str, groups: Sequence[str], panel: str) -> pd.DataFrame:
     if rows.groupby("base_model")[column].nunique().max() < 2:
         return pd.DataFrame(columns=list(GROUPED_COLUMNS))
     right = rows.assign(right=(rows["predicted"] == rows["label"]).astype(np.float64))
@@ -331,7 +326,7 @@ def _effect(
             values.append(mean.mean())
             variances.append(variance_of_mean(mean, counts=True))
         value = float(np.mean(values))
-        low, high = mean_of(variances).interval(value, level, "fraction")
+        low, high = mean_of(variances).interval(value, scale="fraction")
         records.append((panel, model, group, value, low, high, np.nan,
                         subset["stimulus"].nunique(), ""))  # fmt: skip
     table = pd.DataFrame(records, columns=list(GROUPED_COLUMNS))

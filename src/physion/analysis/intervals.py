@@ -31,6 +31,9 @@ from physion.core.seeds import generator
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int_]
 
+LEVEL = 0.95
+"""Fraction of the intervals that contain the expected value of the statistic."""
+
 Scale = Literal["identity", "fraction", "correlation", "positive"]
 """Scale on which a statistic is nearly normal: as it is, or by the logit (0 to 1), the inverse
 hyperbolic tangent (-1 to 1) or the logarithm (above 0)."""
@@ -50,7 +53,7 @@ class Variance(NamedTuple):
         return Variance(self.value[k], self.df[k])
 
     def interval(
-        self, value: float, level: float = 0.95, scale: Scale = "identity"
+        self, value: float, level: float = LEVEL, scale: Scale = "identity"
     ) -> tuple[float, float]:
         """Return the interval of a single statistic.
 
@@ -173,10 +176,10 @@ def variance_of_mean(values: Array, *, counts: bool = False) -> Variance:
     return Variance(np.where(n > 0, found.value, np.nan), found.df)
 
 
-def wilson(fraction: npt.ArrayLike, n: npt.ArrayLike, level: float = 0.95) -> tuple[Array, Array]:
+def wilson(fraction: npt.ArrayLike, n: npt.ArrayLike) -> tuple[Array, Array]:
     """Return Wilson's interval of fractions of ``n`` independent trials; NaN if undefined."""
     p, size = np.asarray(fraction, np.float64), np.asarray(n, np.float64)
-    z = float(special.ndtri(0.5 + level / 2))
+    z = float(special.ndtri(0.5 + LEVEL / 2))
     with np.errstate(divide="ignore", invalid="ignore"):
         centre = (p + z * z / (2 * size)) / (1 + z * z / size)
         half = z / (1 + z * z / size) * np.sqrt(p * (1 - p) / size + (z / (2 * size)) ** 2)
@@ -329,15 +332,14 @@ _SCALES: dict[Scale, Callable[[float], Scaled]] = {
 
 @dataclass(frozen=True)
 class Bootstrap:
-    """Settings of the bootstrap: draws, seed, and the fraction of draws that an interval covers."""
+    """Settings of the bootstrap: number of draws, and their seed."""
 
     resamples: int = 1000
     seed: int = 0
-    level: float = 0.95
 
     def __post_init__(self) -> None:
-        if self.resamples < 1 or not 0 < self.level < 1:
-            raise BadInputError("a bootstrap needs resamples >= 1 and a level between 0 and 1")
+        if self.resamples < 1:
+            raise BadInputError("a bootstrap needs resamples >= 1")
 
     def weights(self, stratum: str, n: int) -> Array:
         """Return how often each of ``n`` stimuli or people is drawn: (resamples, n), rows sum to n.
@@ -354,7 +356,7 @@ class Bootstrap:
         defined = draws[np.isfinite(draws)]
         if not len(defined) or 2 * len(defined) < len(draws):
             return float("nan"), float("nan")
-        tail = 50 * (1 - self.level)
+        tail = 50 * (1 - LEVEL)
         low, high = np.percentile(defined, [tail, 100 - tail])
         return float(low), float(high)
 

@@ -24,6 +24,7 @@ import pandas as pd
 from scipy import stats
 from scipy.linalg import null_space
 
+from physion.analysis.intervals import LEVEL
 from physion.core.errors import BadInputError, UnknownNameError
 
 Array = npt.NDArray[np.float64]
@@ -82,7 +83,6 @@ class MixedFit:
     warnings: tuple[str, ...]
     covariance: Array
     terms: Mapping[str, tuple[int, ...]]
-    level: float
     _linear: Any = field(default=None, repr=False)
 
     def contrast(self, weights: npt.ArrayLike) -> pd.Series:
@@ -92,7 +92,7 @@ class MixedFit:
         """
         one = np.atleast_2d(np.asarray(weights, dtype=np.float64))
         b = self.table["b"].to_numpy(dtype=np.float64)
-        return _estimates(one, b, self.covariance, self._linear, self.level).iloc[0]
+        return _estimates(one, b, self.covariance, self._linear).iloc[0]
 
     def joint_test(self, term: str) -> JointTest:
         """Test that every coefficient of ``term`` is zero (Wald), others as in the model.
@@ -116,32 +116,31 @@ class MixedFit:
         return JointTest(term, statistic, len(places), df2, p)
 
 
-def fit_linear(formula: str, data: pd.DataFrame, level: float = 0.95) -> MixedFit:
+def fit_linear(formula: str, data: pd.DataFrame) -> MixedFit:
     """Fit a linear mixed model by restricted maximum likelihood.
 
     The response is numeric, or True/False for the linear probability models of the paper
     (``model_correct ~ ...``). The table has t tests with Satterthwaite's degrees of freedom.
-    ``level``: of the intervals.
 
     Rows with a missing value are left out, counted in ``left_out`` and named in ``warnings``.
     Raises `BadInputError` for unknown columns, a constant response, a group of one level or with a
     level for each row, and fixed effects that depend on each other or explain everything.
     """
-    return _fit(formula, data, level, logistic=False)
+    return _fit(formula, data, logistic=False)
 
 
-def fit_logistic(formula: str, data: pd.DataFrame, level: float = 0.95) -> MixedFit:
+def fit_logistic(formula: str, data: pd.DataFrame) -> MixedFit:
     """Fit a logistic mixed model by maximum likelihood (Laplace approximation).
 
-    The response is True/False or 0/1; the table has z tests. ``level``: of the intervals. Missing
-    values as in `fit_linear`. Raises `BadInputError` for unknown columns, a response that is not of
-    two classes, a group of one level, fixed effects that depend on each other, and for separation
-    (a coefficient that would be infinite).
+    The response is True/False or 0/1; the table has z tests. Missing values as in `fit_linear`.
+    Raises `BadInputError` for unknown columns, a response that is not of two classes, a group of
+    one level, fixed effects that depend on each other, and for separation (a coefficient that would
+    be infinite).
     """
-    return _fit(formula, data, level, logistic=True)
+    return _fit(formula, data, logistic=True)
 
 
-def _fit(formula: str, data: pd.DataFrame, level: float, logistic: bool) -> MixedFit:
+def _fit(formula: str, data: pd.DataFrame, logistic: bool) -> MixedFit:
     import mixedlm
     from mixedlm.models.checks import ModelCheckError
 
@@ -176,9 +175,7 @@ def _fit(formula: str, data: pd.DataFrame, level: float, logistic: bool) -> Mixe
         raise BadInputError(UNDETERMINED)
     starts = np.cumsum([0, *map(len, terms.values())])
     places = zip(terms, starts[:-1], starts[1:], strict=True)
-    table = _estimates(
-        np.eye(len(names)), model.beta, covariance, None if logistic else model, level
-    )
+    table = _estimates(np.eye(len(names)), model.beta, covariance, None if logistic else model)
     table.insert(0, "term", names)
     random = pd.DataFrame(
         {
@@ -202,7 +199,6 @@ def _fit(formula: str, data: pd.DataFrame, level: float, logistic: bool) -> Mixe
         warnings=found,
         covariance=covariance,
         terms={name: tuple(range(first, end)) for name, first, end in places},
-        level=level,
         _linear=None if logistic else model,
     )
 
@@ -349,16 +345,14 @@ def _combine(df: Array) -> float:
     return 2 * expected / (expected - len(df))
 
 
-def _estimates(
-    contrasts: Array, b: Array, covariance: Array, linear: Any, level: float
-) -> pd.DataFrame:
+def _estimates(contrasts: Array, b: Array, covariance: Array, linear: Any) -> pd.DataFrame:
     """Return value, standard error, test and interval of each linear combination of ``b``;
     ``linear``: the model, if it is linear.
     """
     se = np.sqrt(np.einsum("ij,jk,ik->i", contrasts, covariance, contrasts))
     df = np.full(len(se), np.inf) if linear is None else _satterthwaite(linear, contrasts)
     value = contrasts @ b
-    reach = stats.t.ppf(0.5 + level / 2, df) * se
+    reach = stats.t.ppf(0.5 + LEVEL / 2, df) * se
     return pd.DataFrame(
         {
             "b": value,

@@ -155,7 +155,6 @@ def _difference(
         pooled.p_contact[both][:, shared],
         pooled.p_yes[shared],
         np.unique(pooled.scenario, return_inverse=True)[1][shared],
-        level=draws.level,
         permutations=permutations,
         seed=draws.seed,
     )

@@ -148,9 +148,7 @@ def _majority(yes: Array) -> Array:
     return np.where(yes > 0.5, 1.0, np.where(yes == 0.5, 0.5, 0.0))
 
 
-def compare_populations(
-    comparison: Comparison, predictions: pd.DataFrame, level: float = 0.95
-) -> PopulationResults:
+def compare_populations(comparison: Comparison, predictions: pd.DataFrame) -> PopulationResults:
     """Compare models as populations with each other and with people.
 
     Parameters
@@ -160,8 +158,6 @@ def compare_populations(
     predictions
         From `name_models`: models that differ in nothing but their seed, or file of weights, are
         one population. If no two do, all models together are the population `MODELS`.
-    level
-        Level of the intervals.
 
     Raises
     ------
@@ -208,14 +204,14 @@ def compare_populations(
         fractions = [of[:, None] for of in yes]
         populations.insert(0, _Population(PEOPLE, yes, count, labels, (), fractions))
     return PopulationResults(
-        pd.concat([_consensus(one, scenarios, level) for one in populations], ignore_index=True),
-        _agreement(populations, scenarios, level),
-        _differences(populations, scenarios, level),
+        pd.concat([_consensus(one, scenarios) for one in populations], ignore_index=True),
+        _agreement(populations, scenarios),
+        _differences(populations, scenarios),
         (warning,) if len(wide) < len(every) else (),
     )
 
 
-def _consensus(population: _Population, scenarios: Sequence[str], level: float) -> pd.DataFrame:
+def _consensus(population: _Population, scenarios: Sequence[str]) -> pd.DataFrame:
     sizes = [len(label) for label in population.label]
     spread = [by.std(ddof=1) if len(by) > 1 else np.nan for by in population.by_member]
     if population.by_member:
@@ -233,16 +229,14 @@ def _consensus(population: _Population, scenarios: Sequence[str], level: float) 
         }
     )
     columns = {
-        "consensus": _by_scenario(_mean_of(population.right), sizes, level, "fraction", True),
-        "member": _by_scenario(_mean_of(population.member_right), sizes, level, "fraction"),
+        "consensus": _by_scenario(_mean_of(population.right), sizes, "fraction", True),
+        "member": _by_scenario(_mean_of(population.member_right), sizes, "fraction"),
     }
     table = pd.concat([table, _with_ends(columns)], axis=1)
     return table.assign(member_sd=spread if spread else np.nan)
 
 
-def _agreement(
-    populations: Sequence[_Population], scenarios: Sequence[str], level: float
-) -> pd.DataFrame:
+def _agreement(populations: Sequence[_Population], scenarios: Sequence[str]) -> pd.DataFrame:
     """Return every two populations, and each with itself."""
     sizes = [len(label) for label in populations[0].label]
     tables = []
@@ -253,9 +247,9 @@ def _agreement(
             for whose in WHOSE:
                 of = raters[whose]
                 columns[f"disagreement_{whose}"] = _by_scenario(
-                    _disagreement_of(of), sizes, level, "fraction"
+                    _disagreement_of(of), sizes, "fraction"
                 )
-                columns[f"kappa_{whose}"] = _by_scenario(_kappa_of(of), sizes, level, "correlation")
+                columns[f"kappa_{whose}"] = _by_scenario(_kappa_of(of), sizes, "correlation")
             table = pd.DataFrame({"first": first.name, "second": second.name,
                                   "scenario": [*scenarios, MEAN],
                                   "stimuli": [*sizes, sum(sizes)]})  # fmt: skip
@@ -284,9 +278,7 @@ def _raters(first: _Population, second: _Population) -> dict[str, Callable[[int]
     return {"members": members, "majorities": majorities}
 
 
-def _differences(
-    populations: Sequence[_Population], scenarios: Sequence[str], level: float
-) -> pd.DataFrame:
+def _differences(populations: Sequence[_Population], scenarios: Sequence[str]) -> pd.DataFrame:
     """Return the accuracies of populations of models less people's, by size."""
     columns = ["population", "scenario", "stimuli"]
     columns += [f"{name}{end}" for name in ("consensus", "member") for end in ("", "_low", "_high")]
@@ -297,8 +289,8 @@ def _differences(
     tables = []
     for one in populations[1:]:
         found = {
-            "consensus": _by_scenario(_mean_of(one.right, people.right), sizes, level),
-            "member": _by_scenario(_mean_of(one.member_right, people.member_right), sizes, level),
+            "consensus": _by_scenario(_mean_of(one.right, people.right), sizes),
+            "member": _by_scenario(_mean_of(one.member_right, people.member_right), sizes),
         }
         table = pd.DataFrame({"population": one.name, "scenario": [*scenarios, MEAN],
                               "stimuli": [*sizes, sum(sizes)]})  # fmt: skip
@@ -350,7 +342,6 @@ Estimates = list[tuple[float, float, float]]
 def _by_scenario(
     compute: Compute,
     sizes: Sequence[int],
-    level: float,
     scale: Scale = "identity",
     counts: bool = False,
 ) -> Estimates:
@@ -361,10 +352,10 @@ def _by_scenario(
     found: Estimates = []
     for at, of in enumerate(values):
         variance = jackknife(of[1:][strata == at], counts=counts)
-        found.append((float(of[0]), *variance.interval(float(of[0]), level, scale)))
+        found.append((float(of[0]), *variance.interval(float(of[0]), scale=scale)))
     mean = np.mean(values, axis=0)
     variance = jackknife(mean[1:], strata, counts=counts)
-    found.append((float(mean[0]), *variance.interval(float(mean[0]), level, scale)))
+    found.append((float(mean[0]), *variance.interval(float(mean[0]), scale=scale)))
     return found
 
 

@@ -72,19 +72,13 @@ def read_rollout_errors(paths: Sequence[Path]) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
-def rollout_error_table(errors: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
+def rollout_error_table(errors: pd.DataFrame) -> pd.DataFrame:
     """Return mean errors with intervals; `COLUMNS`.
 
-    The baseline belongs to the first model, since the step of a model decides its last velocity. A
-    panel `MEAN` with the mean over scenarios follows if there are several.
-
-    Parameters
-    ----------
-    errors
-        From `read_rollout_errors`.
-    level
-        Level of the intervals, which are symmetric in the logarithm of the mean error. Errors are
-        skewed, which `degrees_of_freedom` takes into account.
+    ``errors``: from `read_rollout_errors`. The baseline belongs to the first model, since the step
+    of a model decides its last velocity. A panel `MEAN` with the mean over scenarios follows if
+    there are several. Intervals are symmetric in the logarithm of the mean error. Errors are
+    skewed, which `degrees_of_freedom` takes into account.
     """
     models = list(dict.fromkeys(errors["model"]))
     scenarios = in_order(set(errors["scenario"]))
@@ -101,7 +95,7 @@ def rollout_error_table(errors: pd.DataFrame, level: float = 0.95) -> pd.DataFra
         if len(means) > 1:
             means[MEAN] = _mean_over_scenarios(list(means.values()))
         rows += [
-            _rows(values, level).assign(panel=panel, model=name, kind=kind)
+            _rows(values).assign(panel=panel, model=name, kind=kind)
             for panel, values in means.items()
         ]
     table = pd.concat(rows, ignore_index=True)[list(COLUMNS)]
@@ -145,11 +139,11 @@ def _mean_over_scenarios(parts: Sequence[pd.DataFrame]) -> pd.DataFrame:
     )
 
 
-def _rows(means: pd.DataFrame, level: float) -> pd.DataFrame:
+def _rows(means: pd.DataFrame) -> pd.DataFrame:
     variance = Variance(means["variance"].to_numpy(), means["df"].to_numpy())
     bounds = np.array(
         [
-            variance.of(k).interval(float(value), level, "positive")
+            variance.of(k).interval(float(value), scale="positive")
             for k, value in enumerate(means["value"])
         ]
     ).reshape(-1, 2)

@@ -39,16 +39,11 @@ Explain = Callable[[pd.DataFrame], dict[str, str]]
 """Function from rows of stimuli to reasons for what is undefined, by the label of the metric."""
 
 
-def score_table(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
+def score_table(stimuli: pd.DataFrame) -> pd.DataFrame:
     """Return the scores of every model.
 
-    Parameters
-    ----------
-    stimuli
-        One row per model and stimulus, as `Comparison.stimuli`.
-    level
-        Level of the intervals, which are about other stimuli of the same number in each scenario,
-        with the same people (`jackknife`).
+    ``stimuli``: one row per model and stimulus, as `Comparison.stimuli`. Intervals are about other
+    stimuli of the same number in each scenario, with the same people (`jackknife`).
 
     Returns
     -------
@@ -62,7 +57,7 @@ def score_table(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
     # Sorted, so that rounding does not depend on the order of the files.
     ordered = stimuli.sort_values("stimulus", kind="stable")
     parts = [
-        _scenario_rows(rows, level, _of_models, _why_undefined)
+        _scenario_rows(rows, _of_models, _why_undefined)
         for _, rows in ordered.groupby("model", sort=False)
     ]
     table = _without_likeness(pd.concat(parts, ignore_index=True))
@@ -87,17 +82,17 @@ def _without_likeness(table: pd.DataFrame) -> pd.DataFrame:
     return table
 
 
-def two_people_table(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
+def two_people_table(stimuli: pd.DataFrame) -> pd.DataFrame:
     """Return the scores of one person with another, with the columns of `score_table`.
 
     ``stimuli`` has one row per stimulus, whose predictions do not matter. Metrics that are not
     defined for two people are NaN.
     """
     ordered = stimuli.sort_values("stimulus", kind="stable")
-    return _scenario_rows(ordered, level, _of_two_people, _why_no_pair)
+    return _scenario_rows(ordered, _of_two_people, _why_no_pair)
 
 
-def _scenario_rows(rows: pd.DataFrame, level: float, scores: Compute, why: Explain) -> pd.DataFrame:
+def _scenario_rows(rows: pd.DataFrame, scores: Compute, why: Explain) -> pd.DataFrame:
     names = in_order(rows["scenario"])
     parts = [rows[rows["scenario"] == name] for name in names]
     weights, strata = delete_one([len(part) for part in parts])
@@ -109,7 +104,7 @@ def _scenario_rows(rows: pd.DataFrame, level: float, scores: Compute, why: Expla
     for at, (name, part, because) in enumerate(zip(names, parts, reasons, strict=True)):
         own = np.concatenate([[True], strata == at])
         values_of = {key: values[own] for key, values in by_scenario[at].items()}
-        records.append(_record(name, part, values_of, None, level, [*because.values()]))
+        records.append(_record(name, part, values_of, None, [*because.values()]))
     one_class = [name for name, part in zip(names, parts, strict=True) if _one_class(part)]
     undefined: dict[str, list[str]] = {}
     for name, because in zip(names, reasons, strict=True):
@@ -117,11 +112,11 @@ def _scenario_rows(rows: pd.DataFrame, level: float, scores: Compute, why: Expla
             undefined.setdefault(label, []).append(name)
     whys = [f"{label}: undefined in {', '.join(where)}" for label, where in undefined.items()]
     whys += [f"labels: of one class in {', '.join(one_class)}"] if one_class else []
-    records.append(_record(MEAN, rows, mean, strata, level, whys))
+    records.append(_record(MEAN, rows, mean, strata, whys))
     for key in ("ceiling", "floor"):
         records[-1][key] = float(np.mean([record[key] for record in records[:-1]]))
     pooled = scores(pool(samples))
-    records.append(_record(POOLED, rows, pooled, strata, level, [*why(rows).values()]))
+    records.append(_record(POOLED, rows, pooled, strata, [*why(rows).values()]))
     table = pd.DataFrame(records)
     for position, column in enumerate(("model", "base_model", "readout")):
         table.insert(position, column, rows[column].iloc[0])
@@ -163,7 +158,6 @@ def _record(
     rows: pd.DataFrame,
     values_of: dict[str, Array],
     strata: Integers | None,
-    level: float,
     whys: list[str],
 ) -> dict[str, Any]:
     reasons = [*whys]
@@ -178,7 +172,7 @@ def _record(
     for key, values in values_of.items():
         metric = metrics.get(key)
         variance = jackknife(values[1:], strata, counts=metric.counts)
-        low, high = variance.interval(float(values[0]), level, metric.scale)
+        low, high = variance.interval(float(values[0]), scale=metric.scale)
         if np.isfinite(values[0]) and np.isnan(low) and len(rows) > 1:
             name = metric.label or key
             reasons.append(f"{name}: no interval, too few stimuli or undefined without one of them")
@@ -236,7 +230,7 @@ def runs_table(scores: pd.DataFrame, bootstrap: Bootstrap | None = None) -> pd.D
         From `score_table`, with ``kind``. A run is one of its models: a readout, a training and a
         seed of a base model.
     bootstrap
-        Draws of the runs, and the level of the intervals.
+        Draws of the runs.
 
     Returns
     -------
@@ -277,9 +271,7 @@ AVERAGES = {MEAN: "mean over scenarios", POOLED: "all stimuli pooled"}
 BOOTSTRAP = ("bootstrap_low", "bootstrap_high")
 
 
-def people_table(
-    people: pd.DataFrame, zone: pd.DataFrame | None, level: float = 0.95
-) -> pd.DataFrame:
+def people_table(people: pd.DataFrame, zone: pd.DataFrame | None) -> pd.DataFrame:
     """Return the people by scenario and, in row `MEAN`, averaged over scenarios.
 
     ``people`` has one row per stimulus, from `with_labels`.
@@ -297,9 +289,9 @@ def people_table(
     for name in in_order(people["scenario"]):
         rows = people[people["scenario"] == name].sort_values("stimulus", kind="stable")
         variances.append(variance_of_mean(rows["accuracy"].to_numpy(dtype=np.float64)))
-        records.append(_people_record(name, rows, variances[-1], zones.get(name, {}), level))
+        records.append(_people_record(name, rows, variances[-1], zones.get(name, {})))
     table = pd.DataFrame(records)
-    low, high = mean_of(variances).interval(float(table["accuracy"].mean()), level, "fraction")
+    low, high = mean_of(variances).interval(float(table["accuracy"].mean()), scale="fraction")
     averaged = ["people", "base_rate", "yes", "accuracy", "reliability", "ceiling"]
     mean = {"scenario": MEAN, "stimuli": len(people), "accuracy_low": low, "accuracy_high": high}
     mean |= {column: float(table[column].mean(skipna=False)) for column in averaged}
@@ -308,9 +300,9 @@ def people_table(
 
 
 def _people_record(
-    name: str, rows: pd.DataFrame, variance: Variance, zone: dict[str, float], level: float
+    name: str, rows: pd.DataFrame, variance: Variance, zone: dict[str, float]
 ) -> dict[str, Any]:
-    low, high = variance.interval(float(rows["accuracy"].mean()), level, "fraction")
+    low, high = variance.interval(float(rows["accuracy"].mean()), scale="fraction")
     return {
         "scenario": name,
         "stimuli": len(rows),
@@ -398,7 +390,7 @@ def _answering(seen: pd.DataFrame, name: str, yes: pd.Series) -> pd.DataFrame:
     return table.assign(gap=table["p_contact"] - table["p_yes"]).reset_index(drop=True)
 
 
-def baseline_scores(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
+def baseline_scores(stimuli: pd.DataFrame) -> pd.DataFrame:
     """Return `with_kind` of the scores of the computed baselines; empty without people.
 
     ``stimuli``: as for `baseline_stimuli`.
@@ -406,8 +398,8 @@ def baseline_scores(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
     seen, answers = seen_stimuli(stimuli), baseline_stimuli(stimuli)
     if seen.empty:
         return pd.DataFrame()
-    parts = [score_table(answers, level)] if len(answers) else []
-    parts.append(two_people_table(seen, level))
+    parts = [score_table(answers)] if len(answers) else []
+    parts.append(two_people_table(seen))
     return with_kind(pd.concat(parts, ignore_index=True))
 
 

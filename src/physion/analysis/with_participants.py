@@ -421,11 +421,11 @@ def _two_people(name: str, models: Models, answers: ScenarioAnswers, sample: Sam
     )
 
 
-def measure_table(measured: Sequence[Measured], level: float = 0.95) -> pd.DataFrame:
+def measure_table(measured: Sequence[Measured]) -> pd.DataFrame:
     """Return one row per model and measure.
 
     Columns: ``model``, ``scenario``, ``measure``, ``stimuli``, ``value``; ``low`` and ``high`` with
-    ``_people``, ``_stimuli``, ``_both`` (interval by what is drawn, at this ``level``) and
+    ``_people``, ``_stimuli``, ``_both`` (interval by what is drawn) and
     ``_bootstrap`` (percentiles over draws of participants, as preregistered; the noise of their
     averages counts twice in it); for measures by participant also ``pair_low``, ``pair_median``,
     ``pair_high`` (percentiles over participants) and ``undefined`` (participants for whom it is
@@ -435,10 +435,10 @@ def measure_table(measured: Sequence[Measured], level: float = 0.95) -> pd.DataF
     for one in measured:
         for measure, value in one.values.items():
             variances = {what: one.variances[what].get(measure) for what in RESAMPLED}
-            record, reasons = _interval_columns(measure, value, variances, level)
+            record, reasons = _interval_columns(measure, value, variances)
             if measure in one.reasons:
                 reasons.insert(0, one.reasons[measure])
-            ends = Bootstrap(level=level).interval(one.draws.get(measure, np.empty(0)))
+            ends = Bootstrap().interval(one.draws.get(measure, np.empty(0)))
             record |= dict(zip(("low_bootstrap", "high_bootstrap"), ends, strict=True))
             if measure in one.by_participant:
                 found = distribution(one.by_participant[measure])
@@ -483,7 +483,7 @@ def _mean(rows: Sequence[Measured]) -> Measured:
 
 
 def _interval_columns(
-    measure: str, value: float, variances: Mapping[Resampled, Variance | None], level: float
+    measure: str, value: float, variances: Mapping[Resampled, Variance | None]
 ) -> tuple[dict[str, Any], list[str]]:
     """Return ``value`` with ``low_`` and ``high_`` by what is drawn, and reasons for what is
     NaN.
@@ -497,7 +497,7 @@ def _interval_columns(
             reasons.append(f"no interval over {what}: they do not enter")
         elif np.isfinite(value):
             scale = metrics.get(measure).scale
-            low, high = variance.interval(value, level, scale)
+            low, high = variance.interval(value, scale=scale)
             if np.isnan(low):
                 reasons.append(f"no interval over {what}: too few, or undefined without some")
         record |= {f"low_{what}": low, f"high_{what}": high}

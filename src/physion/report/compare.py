@@ -24,7 +24,7 @@ from physion.analysis.check import (
 )
 from physion.analysis.compare import all_results, tidy_scores
 from physion.analysis.comparison import NOT_PREDICTED, check_coverage
-from physion.analysis.intervals import Bootstrap
+from physion.analysis.intervals import LEVEL, Bootstrap
 from physion.analysis.model_tests import fits_of_people
 from physion.analysis.people.exclusions import Expected, find_expected, read_expected
 from physion.analysis.people.responses import Participants, check_labels, keep_where
@@ -178,8 +178,8 @@ class CompareResult:
         folder
             Folder for ``report.html``, ``report.json``, ``tables/`` and ``figures/``.
         **page
-            Fields of `physion.report.ReportInputs` such as ``movies``, ``title``
-            and ``methods``, which are added to the comparison's.
+            Fields of `ReportInputs` such as ``movies``, ``title`` and ``methods``, which are added
+            to the comparison's.
 
         Raises
         ------
@@ -539,7 +539,7 @@ def compare(
         model_inputs=_by_model(rows, "inputs"),
         model_seen=_seen(rows),
         model_weights=_by_model(rows, "init"),
-        rollout_errors=None if errors is None else rollout_error_table(errors, draws.level),
+        rollout_errors=None if errors is None else rollout_error_table(errors),
     )
     return CompareResult(tidy_scores(results), results.people, inputs)
 
@@ -839,6 +839,6 @@ def _describe_expected(people: PeopleResults, given: bool) -> str:
 def _describe_intervals(draws: Bootstrap) -> str:
     """Describe the intervals of results about people."""
     return (
-        f"{draws.level:.0%} percentile bootstrap, people drawn within each scenario, "
+        f"{LEVEL:.0%} percentile bootstrap, people drawn within each scenario, "
         f"{draws.resamples} resamples, seed {draws.seed}"
     )

@@ -17,7 +17,7 @@ import numpy.typing as npt
 import pandas as pd
 from scipy import stats
 
-from physion.analysis.intervals import Bootstrap, distribution
+from physion.analysis.intervals import LEVEL, Bootstrap, distribution
 from physion.analysis.people.measures import (
     accuracy_by_participant,
     all_answers,
@@ -389,14 +389,14 @@ def answer_rows(test: pd.DataFrame, stimuli: pd.DataFrame) -> pd.DataFrame:
     return test[columns].merge(own, on="stimulus", how="left", validate="many_to_one")
 
 
-def regress_hypotheses(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
+def regress_hypotheses(stimuli: pd.DataFrame) -> pd.DataFrame:
     """Test each hypothesis in each scenario and, in row ``all``, over all with an intercept for
     each.
 
     ``stimuli``: from `with_attributes`, with ``mean_log_rt`` for H4. Columns: ``b`` (change of the
     outcome per unit of the predictor), ``se`` (HC3, valid for unequal variances), ``t``, ``df``,
     ``p`` (two-sided), ``low``, ``high``, ``r`` (Pearson's, within scenarios) and ``spearman`` (in
-    ``all`` of values less their scenario's mean), ``as_predicted`` (for p < 1 - ``level`` *yes* if
+    ``all`` of values less their scenario's mean), ``as_predicted`` (for p < 1 - `LEVEL` *yes* if
     b has the predicted sign, else *opposite*; for a larger p *not shown*), ``left_out`` (stimuli
     without predictor or outcome), ``reason``. The reason also reports if distractors and occluders
     always occur together: then their effects cannot be separated.
@@ -407,11 +407,11 @@ def regress_hypotheses(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFra
                  in_order(stimuli["scenario"])]  # fmt: skip
         if len(parts) > 1:
             parts.append(("all", stimuli))
-        records += [_record(hypothesis, name, rows, level) for name, rows in parts]
+        records += [_record(hypothesis, name, rows) for name, rows in parts]
     return pd.DataFrame(records, columns=list(COLUMNS))
 
 
-def _record(hypothesis: Hypothesis, name: str, rows: pd.DataFrame, level: float) -> dict[str, Any]:
+def _record(hypothesis: Hypothesis, name: str, rows: pd.DataFrame) -> dict[str, Any]:
     record: dict[str, Any] = dict.fromkeys(COLUMNS, np.nan)
     record |= {"hypothesis": hypothesis.name, "scenario": name, "reason": "",
                "predictor": hypothesis.predictor, "outcome": hypothesis.outcome}  # fmt: skip
@@ -431,17 +431,17 @@ def _record(hypothesis: Hypothesis, name: str, rows: pd.DataFrame, level: float)
     x, y = (_within(used, c) for c in (hypothesis.predictor, hypothesis.outcome))
     if np.allclose(y, 0):
         return {**record, "reason": "the outcome does not vary"}
-    record |= within_scenarios(used, {"x": x[:, None]}, hypothesis.outcome, level)[0].iloc[0]
+    record |= within_scenarios(used, {"x": x[:, None]}, hypothesis.outcome)[0].iloc[0]
     record["r"] = pearson(x, y)
     record["spearman"] = float(stats.spearmanr(x, y).statistic)
-    record["as_predicted"] = _verdict(record, hypothesis.sign, level)
+    record["as_predicted"] = _verdict(record, hypothesis.sign)
     record["reason"] = _confounded(hypothesis, used)
     return record
 
 
-def _verdict(record: Mapping[str, Any], sign: int, level: float) -> str:
+def _verdict(record: Mapping[str, Any], sign: int) -> str:
     """Return whether the test shows an effect in the direction of ``sign``, or in the other."""
-    if not record["p"] < 1 - level:
+    if not record["p"] < 1 - LEVEL:
         return "not shown"
     return "yes" if np.sign(record["b"]) == sign else "opposite"
 
@@ -459,7 +459,7 @@ def _centred(values: Array, scenario: pd.Series) -> Array:
 
 
 def within_scenarios(
-    rows: pd.DataFrame, terms: Mapping[str, Array], outcome: str, level: float = 0.95
+    rows: pd.DataFrame, terms: Mapping[str, Array], outcome: str
 ) -> tuple[pd.DataFrame, dict[str, float]]:
     """Fit least squares with an intercept for each scenario, and HC3 standard errors.
 
@@ -471,8 +471,6 @@ def within_scenarios(
         Columns (n, k) by the name of their term, without missing values.
     outcome
         Column to explain.
-    level
-        Level of the intervals.
 
     Returns
     -------
@@ -488,7 +486,7 @@ def within_scenarios(
     y = rows[outcome].to_numpy(np.float64)
     fit = OLS(y, np.hstack([x, intercepts])).fit(cov_type="HC3", use_t=True)
     k, all_columns = x.shape[1], np.eye(x.shape[1] + intercepts.shape[1])
-    low, high = fit.conf_int(1 - level)[:k].T
+    low, high = fit.conf_int(1 - LEVEL)[:k].T
     table = pd.DataFrame(
         {"b": fit.params[:k], "se": fit.bse[:k], "t": fit.tvalues[:k], "df": fit.df_resid,
          "p": fit.pvalues[:k], "low": low, "high": high}
@@ -511,9 +509,7 @@ ATTRIBUTE_COLUMNS = (
 )  # fmt: skip
 
 
-def regress_attributes(
-    stimuli: pd.DataFrame, names: Sequence[str], level: float = 0.95
-) -> pd.DataFrame:
+def regress_attributes(stimuli: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
     """Regress people's accuracy on each attribute, and on all together, by scenario and over all.
 
     Parameters
@@ -522,8 +518,6 @@ def regress_attributes(
         From `with_attributes`.
     names
         Columns with attributes: numbers, or text, whose values are categories.
-    level
-        Level of the intervals.
 
     Returns
     -------
@@ -542,7 +536,7 @@ def regress_attributes(
     for scenario, rows in parts:
         fits = [("single", [name]) for name in names]
         fits.append(("together", [name for name in names if name != "configuration"]))
-        tables = [_attribute_fit(rows, chosen, level).assign(fit=fit) for fit, chosen in fits]
+        tables = [_attribute_fit(rows, chosen).assign(fit=fit) for fit, chosen in fits]
         for own in (pd.concat(tables[:-1]), tables[-1]) if names else ():
             each = own.drop_duplicates("attribute").set_index("attribute")["p_term"]
             holm = pd.Series(corrected_p(each, "holm"), index=each.index)
@@ -551,7 +545,7 @@ def regress_attributes(
     return table.reindex(columns=list(ATTRIBUTE_COLUMNS))
 
 
-def _attribute_fit(rows: pd.DataFrame, names: Sequence[str], level: float) -> pd.DataFrame:
+def _attribute_fit(rows: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
     """Return one row per column of the attributes, or one with the reason why there is none."""
     reasons: dict[str, str] = {}
     values = rows[list(names)]
@@ -585,7 +579,7 @@ def _attribute_fit(rows: pd.DataFrame, names: Sequence[str], level: float) -> pd
     missing = pd.DataFrame(records).assign(p_term=np.nan)
     if not terms:
         return missing
-    table, fit = within_scenarios(used, terms, "accuracy", level)
+    table, fit = within_scenarios(used, terms, "accuracy")
     spread = [
         float(np.std(_centred(column, used["scenario"]), ddof=used["scenario"].nunique()))
         for columns in terms.values()

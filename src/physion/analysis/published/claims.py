@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from physion.analysis.intervals import Bootstrap
+from physion.analysis.intervals import LEVEL, Bootstrap
 from physion.analysis.mixed import fit_linear
 from physion.analysis.published.tables import (
     END_TO_END,
@@ -498,7 +498,7 @@ def results_of(released: PublishedTables, bootstrap: Bootstrap | None = None) ->
     }
     descriptions = {
         "accuracies": describe_averages(released)
-        + f" Intervals: {draws.level:.0%}, of a published value a bootstrap over the rows that it "
+        + f" Intervals: {LEVEL:.0%}, of a published value a bootstrap over the rows that it "
         "averages, and next to it by the paper's way, which draws the rows of the whole table, "
         "ungrouped; of the expected cell Wilson's for the stimuli tested.",
         "panels": SELECTION,

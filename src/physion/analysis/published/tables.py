@@ -262,7 +262,6 @@ def accuracy_table(tables: PublishedTables, bootstrap: Bootstrap | None = None) 
     ``difference`` (expected - published).
     """
     draws = bootstrap or Bootstrap()
-    level = draws.level
     counts = count_tested(tables.runs)
     once = tables.distinct
     by_paper = paper_intervals(tables, draws)
@@ -276,7 +275,7 @@ def accuracy_table(tables: PublishedTables, bootstrap: Bootstrap | None = None) 
         cell = own[(own[list(EXPECTED)] == pd.Series(EXPECTED)).all(axis=1)]["accuracy"]
         expected = float(cell.mean()) if len(cell) else float("nan")
         stimuli = counts[(model, scenario)]
-        expected_low, expected_high = wilson(expected, stimuli, level)
+        expected_low, expected_high = wilson(expected, stimuli)
         right, worst, best = people.loc[
             scenario, ["accuracy", "accuracy_low", "accuracy_high"]
         ]  # fmt: skip

@@ -74,7 +74,6 @@ def paired_difference(
     people: Array,
     strata: npt.NDArray[np.int_],
     *,
-    level: float = 0.95,
     permutations: int = 2000,
     seed: int = 0,
 ) -> Difference:
@@ -88,8 +87,6 @@ def paired_difference(
         (n,): fraction of people who say yes.
     strata
         (n,): scenario of each stimulus, for the jackknife interval over stimuli.
-    level
-        Level of the interval.
     permutations, seed
         Number of permutations, and the seed of the coins that decide who is swapped.
 
@@ -113,7 +110,7 @@ def paired_difference(
     if not np.isfinite(difference):
         return Difference()
     without = _pearson(totals[0] - first) - _pearson(totals[1] - second)
-    low, high = jackknife(without, strata).interval(difference, level)
+    low, high = jackknife(without, strata).interval(difference)
     change = swap_coins(permutations, n, seed) @ (second - first)
     swapped = _pearson(totals[0] + change) - _pearson(totals[1] - change)
     as_large = np.sum(np.abs(swapped) >= abs(difference) - 1e-12)
