@@ -17,7 +17,7 @@ from physion.cli import output
 from physion.cli.main import main
 from physion.core.errors import BadInputError
 from physion.data.official import humans_folder, official
-from physion.models import build_model
+from physion.models.build import build_model
 from physion.pipeline import (
     OFFICIAL_MODELS,
     RunSettings,

@@ -11,7 +11,6 @@ import pytest
 
 from physion.clips.batch import Batch, Motion
 from physion.core.errors import BadInputError, UnknownNameError
-from physion.models import build_model
 from physion.models.baselines.pixels import BlobCentroids, CopyLastFrame, color_masks
 from physion.models.baselines.trees import (
     BLOB_FEATURES,
@@ -19,6 +18,7 @@ from physion.models.baselines.trees import (
     STATE_FEATURES,
     mask_blob,
 )
+from physion.models.build import build_model
 from physion.models.gaps import FAR, TOLERANCE, minimise
 from physion.models.interface import Model, can
 from physion.physics.cloth.simulate import ClothSettings

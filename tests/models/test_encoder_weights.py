@@ -25,8 +25,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from physion.core.errors import BadInputError, MissingExtraError, UnknownNameError
-from physion.models import build_model
-from physion.models.build import make_settings
+from physion.models.build import build_model, make_settings
 from physion.models.encoders import weights as packages
 from physion.models.encoders.encoder import EncoderSettings
 from physion.models.encoders.weights import (

@@ -23,7 +23,7 @@ from physion.checking import check
 from physion.cli.main import main
 from physion.clips.batch import Batch, Provenance, Spec
 from physion.core.errors import BadInputError
-from physion.models import build_model
+from physion.models.build import build_model
 from physion.models.feature_table import FeatureTable
 from physion.models.interface import Model
 from physion.readout.check import check_models

@@ -14,7 +14,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from physion.core.errors import BadInputError
-from physion.models import Batch, build_model
+from physion.models import Batch
+from physion.models.build import build_model
 from support.programs import absent
 
 try:

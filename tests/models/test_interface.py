@@ -191,7 +191,7 @@ class Absent:
 sys.meta_path.insert(0, Absent())
 import physion.readout
 from physion.core.errors import MissingExtraError
-from physion.models import build_model
+from physion.models.build import build_model
 for name in ("noisy-simulation", "chance", "state-trees", "already-touched",
              "constant-motion", "blob-centroids", "copy-last-frame"):
     build_model(name)

@@ -14,7 +14,8 @@ import pytest
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.seeds import child_generator, trial_seed
 from physion.data.official import official
-from physion.models import Batch, Motion, build_model
+from physion.models import Batch, Motion
+from physion.models.build import build_model
 from physion.models.noisy_simulation import (
     FITTED,
     NoiseLevels,

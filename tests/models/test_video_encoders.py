@@ -15,7 +15,8 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from physion.core.errors import BadInputError
-from physion.models import Batch, build_model
+from physion.models import Batch
+from physion.models.build import build_model
 from support.programs import absent
 from support.tiny_models import VIDEO
 
@@ -395,7 +396,7 @@ class Absent:
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 sys.meta_path.insert(0, Absent())
 from physion.core.errors import MissingExtraError
-from physion.models import build_model
+from physion.models.build import build_model
 try:
     build_model("VideoMAE")
 except MissingExtraError as error:

@@ -19,8 +19,7 @@ from physion.checking import check
 from physion.cli.main import main
 from physion.clips.batch import Batch
 from physion.core.errors import BadInputError, PhysionError
-from physion.models import models
-from physion.models.build import OutOfMemoryError
+from physion.models.build import OutOfMemoryError, models
 from physion.readout.changes import CHANGES, ChangedTrials, copy_others, take_trials
 from physion.readout.check import REFUSED, SHOWN, CheckedModel, _is_of_the_machine
 from physion.readout.evaluation import Evaluation, run_evaluations

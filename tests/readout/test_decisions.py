@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from physion.core.errors import BadInputError
-from physion.models import build_model
+from physion.models.build import build_model
 from physion.readout.attentive import COMPONENTS, HEADS, AttentiveDecision
 from physion.readout.decisions import (
     ClosestDecision,

@@ -23,7 +23,7 @@ from physion.analysis.tables import check_predictions
 from physion.clips.batch import Batch, Provenance, Rollout, Spec
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.files import digest_of
-from physion.models import build_model, models
+from physion.models.build import build_model, models
 from physion.models.interface import TrainingSettings
 from physion.readout.decisions import Decided
 from physion.readout.evaluate import evaluate

@@ -13,7 +13,7 @@ from physion.clips.batch import Spec
 from physion.clips.clips import whole_source
 from physion.compute.local import SerialExecutor
 from physion.core.errors import BadInputError
-from physion.models import models
+from physion.models.build import models
 from physion.readout.evaluate import evaluate
 from physion.readout.logistic import LogisticSettings
 from physion.readout.settings import EvaluationSettings

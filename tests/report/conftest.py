@@ -9,7 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.analysis import Bootstrap, Comparison, compare_scores
+from physion.analysis.comparison import Comparison, compare_scores
+from physion.analysis.intervals import Bootstrap
 from support.browser import Browser
 
 Maker = Callable[..., Comparison]

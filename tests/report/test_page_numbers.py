@@ -16,10 +16,10 @@ import pandas as pd
 import pytest
 
 from physion.analysis.tables import MEAN, POOLED
-from physion.report import ReportInputs
 from physion.report.build import report_numbers
 from physion.report.compare import CompareResult
 from physion.report.html import Picture
+from physion.report.inputs import ReportInputs
 from physion.report.page import render_page
 from support.small_study import compare_small
 

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from physion.analysis import Comparison
-from physion.report import ReportInputs, build_report
+from physion.analysis.comparison import Comparison
+from physion.report.build import build_report
+from physion.report.inputs import ReportInputs
 from physion.trials.video import encode_movie
 from support.browser import Browser
 

@@ -23,8 +23,8 @@ from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
 
-from physion.analysis import Comparison, figure_tables
-from physion.analysis.comparison import ANOTHER
+from physion.analysis import figure_tables
+from physion.analysis.comparison import ANOTHER, Comparison
 from physion.analysis.model_tests import paired_tests, pool_comparison
 from physion.analysis.people.effects import below_chance_level
 from physion.analysis.rollout_errors import COLUMNS, CONSTANT_VELOCITY, ERRORS

@@ -14,20 +14,21 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.analysis import Bootstrap, Comparison, compare_scores
+from physion.analysis.comparison import Comparison, compare_scores
 from physion.analysis.figure_tables import SCENARIO_ZONE
+from physion.analysis.intervals import Bootstrap
 from physion.analysis.metrics import score_metrics
 from physion.analysis.published.claims import published_results
 from physion.analysis.scores import COMPUTED, MAJORITY, OUTCOME, TWO_PEOPLE
 from physion.analysis.tables import MEAN, POOLED
 from physion.core.errors import BadInputError
-from physion.report import ReportInputs, build_report, people, scores
 from physion.report import html as blocks
-from physion.report.build import report_numbers
+from physion.report import people, scores
+from physion.report.build import build_report, report_numbers
 from physion.report.compare import compare
 from physion.report.figures.theme import make_plots
 from physion.report.html import BASELINES, Picture
-from physion.report.inputs import EXPECTED_METHODS
+from physion.report.inputs import EXPECTED_METHODS, ReportInputs
 from physion.report.page import render_page
 from physion.report.published import build_published_report
 

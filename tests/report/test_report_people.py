@@ -17,10 +17,10 @@ from physion.analysis.statistics.agreement import cross_kappa
 from physion.analysis.tables import attributes_from_table
 from physion.cli.main import main
 from physion.core.errors import BadInputError, UnknownNameError
-from physion.report import ReportInputs
 from physion.report.build import report_numbers
 from physion.report.compare import compare
 from physion.report.figures.theme import make_plots
+from physion.report.inputs import ReportInputs
 from physion.report.page import render_page
 from support.small_study import STEMS, STIMULI, compare_small, predictions, responses
 

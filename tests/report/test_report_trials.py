@@ -13,10 +13,10 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from physion.analysis import Comparison
-from physion.report import ReportInputs
+from physion.analysis.comparison import Comparison
 from physion.report.compare import compare
 from physion.report.html import PageMovies, make_poster
+from physion.report.inputs import ReportInputs
 from physion.report.page import DISAGREE, OPENING, render_page
 from physion.report.scores import inputs_sentence, weights_sentence
 from physion.report.trials import (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from physion.models import build_model
+from physion.models.build import build_model
 
 TINY: dict[str, Any] = {
     "encoder": "test_vit", "image_size": 64, "weights": "random", "hidden": 16,

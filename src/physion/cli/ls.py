@@ -14,7 +14,7 @@ from physion.compute.tasks import executors
 from physion.core.errors import BadInputError
 from physion.core.registry import Registry
 from physion.core.settings import flatten
-from physion.models import models
+from physion.models.build import models
 from physion.physics.engine import engines
 from physion.rendering.rooms import rooms
 from physion.scenes.looks import MATERIALS

@@ -11,9 +11,9 @@ import pandas as pd
 import pytest
 from sklearn.metrics import cohen_kappa_score
 
-from physion.analysis import Bootstrap, Comparison, compare_scores
 from physion.analysis.compare import compare_everywhere
-from physion.analysis.comparison import SETTING
+from physion.analysis.comparison import SETTING, Comparison, compare_scores
+from physion.analysis.intervals import Bootstrap
 from physion.analysis.metrics import metrics
 from physion.analysis.sample import sample_of_rows
 from physion.analysis.scores import (

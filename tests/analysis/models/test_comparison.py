@@ -12,9 +12,16 @@ import pandas as pd
 import pytest
 from scipy import special, stats
 
-from physion.analysis import Bootstrap, Comparison, compare_scores, read_predictions
 from physion.analysis.compare import all_results
-from physion.analysis.comparison import NO_LABEL, NOT_PREDICTED, NOT_SEEN, check_coverage
+from physion.analysis.comparison import (
+    NO_LABEL,
+    NOT_PREDICTED,
+    NOT_SEEN,
+    Comparison,
+    check_coverage,
+    compare_scores,
+)
+from physion.analysis.intervals import Bootstrap
 from physion.analysis.metrics import metric_of_arrays, metrics
 from physion.analysis.model_tests import fits_of_models
 from physion.analysis.people.responses import EXCLUDED, LEDGE
@@ -26,6 +33,7 @@ from physion.analysis.tables import (
     name_models,
     read_humans,
     read_labels,
+    read_predictions,
 )
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.report.compare import compare

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from physion.analysis import Bootstrap
+from physion.analysis.intervals import Bootstrap
 from physion.analysis.people.exclusions import (
     NOT_EXPECTED,
     OFFICIAL_CODE,
