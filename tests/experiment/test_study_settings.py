@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import json
 import os
 import re
 import shlex
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
 from physion.cli.experiment.experiment import SUBVERBS
 from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.tables import markdown_table
 from physion.experiment.store.database import METADATA
 from physion.experiment.study.settings import (
     Attention,
@@ -28,11 +30,9 @@ from physion.experiment.study.settings import (
     Screen,
     StudySettings,
     Timing,
-    all_keys,
     format_settings,
     keys_of,
     parse_settings,
-    settings_table,
     tables,
 )
 from physion.experiment.study.study import Study, load_study, write_settings
@@ -49,6 +49,37 @@ from support.paths import ROOT
 
 LISTS = {"questions", "comprehension_questions", "conditions"}
 """Tables of which there may be several, or none."""
+
+
+class Key(NamedTuple):
+    """A key of ``study.toml``: its table (empty: top level), description and default (None: the key
+    is required, or the default is to have none)."""
+
+    table: str
+    name: str
+    about: str
+    default: Any
+
+
+def all_keys() -> list[Key]:
+    """Return all keys in the order in which they are written."""
+    kinds = [("", StudySettings), *((name, kind) for name, _, kind in tables())]
+    return [
+        Key(table, name, about, getattr(kind, name, None))
+        for table, kind in kinds
+        for name, about in keys_of(kind).items()
+    ]
+
+
+def settings_table() -> str:
+    """Return the Markdown table of all keys for the documentation."""
+    rows = []
+    for key in all_keys():
+        name = f"{key.table}.{key.name}" if key.table else key.name
+        value = json.dumps(key.default, ensure_ascii=False)
+        rows.append((f"`{name}`", "" if key.default is None else f"`{value}`", key.about))
+    table = markdown_table(["key", "default", "meaning"], rows, tight=True)
+    return table.replace(" |  | ", " | | ") + "\n"
 
 
 def test_what_is_written_is_read_back() -> None:
@@ -100,7 +131,7 @@ def test_every_setting_is_written_with_its_description(tmp_path: Path) -> None:
             assert key.name in (parsed[key.table] if key.table else parsed)
     for name, about, kind in tables():
         assert about in " ".join(comments.split())
-        assert {key.name for key in keys_of(kind)} == {f.name for f in dataclasses.fields(kind)}
+        assert set(keys_of(kind)) == {f.name for f in dataclasses.fields(kind)}
         assert name in LISTS or name in parsed
 
 

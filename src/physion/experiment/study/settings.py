@@ -28,7 +28,6 @@ from pydantic import AfterValidator, Field, StringConstraints
 
 from physion.core.errors import BadInputError
 from physion.core.settings import read_settings
-from physion.core.tables import markdown_table
 from physion.experiment.study.stimuli import NAME
 
 HEAD = """\
@@ -592,26 +591,10 @@ def _payment_faults(payment: PaymentRule) -> Iterator[str]:
 # --- writing and describing ----------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Key:
-    """One key of ``study.toml``: its table (empty: top level), description and default (None: the
-    key is required, or the default is to have none).
-    """
-
-    table: str
-    name: str
-    about: str
-    default: Any
-
-
-def keys_of(kind: type, table: str = "") -> list[Key]:
-    """Return the keys of a settings class, without its tables and lists of tables."""
+def keys_of(kind: type) -> dict[str, str]:
+    """Return the descriptions of a settings class' keys, without its tables and lists of tables."""
     about, tables = _descriptions(kind), _table_classes(kind)
-    return [
-        Key(table, field.name, about[field.name], getattr(kind, field.name, None))
-        for field in fields(kind)
-        if field.name not in tables
-    ]
+    return {field.name: about[field.name] for field in fields(kind) if field.name not in tables}
 
 
 def tables() -> list[tuple[str, str, type]]:
@@ -620,13 +603,6 @@ def tables() -> list[tuple[str, str, type]]:
     return [
         (name, about.get(name) or str(kind.__doc__), kind)
         for name, kind in _table_classes(StudySettings).items()
-    ]
-
-
-def all_keys() -> list[Key]:
-    """Return all keys in the order in which they are written."""
-    return keys_of(StudySettings) + [
-        key for name, _, kind in tables() for key in keys_of(kind, name)
     ]
 
 
@@ -664,10 +640,10 @@ def format_settings(settings: StudySettings, path: Path) -> str:
         value, keys = getattr(settings, name), keys_of(kind)
         if isinstance(value, tuple):
             text += "\n" + _comment(about)
-            text += "".join(_comment(key.about, f"  {key.name}: ") for key in keys)
+            text += "".join(_comment(about, f"  {key}: ") for key, about in keys.items())
             for entry in value:
-                given = [key for key in keys if getattr(entry, key.name) is not None]
-                lines = (f"{key.name} = {_toml(getattr(entry, key.name))}\n" for key in given)
+                given = [key for key in keys if getattr(entry, key) is not None]
+                lines = (f"{key} = {_toml(getattr(entry, key))}\n" for key in given)
                 text += f"\n[[{name}]]\n{''.join(lines)}"
         else:
             text += f"\n{_comment(about)}[{name}]\n{_keys(value, keys)}"
@@ -686,10 +662,10 @@ def plain_settings(settings: StudySettings) -> dict[str, Any]:
     return {f.name: plain(getattr(settings, f.name)) for f in fields(StudySettings)}
 
 
-def _keys(values: Any, keys: Sequence[Key]) -> str:
+def _keys(values: Any, keys: Mapping[str, str]) -> str:
     """Return lines with comment and value of each key."""
     return "".join(
-        f"{_comment(key.about)}{key.name} = {_toml(getattr(values, key.name))}\n" for key in keys
+        f"{_comment(about)}{key} = {_toml(getattr(values, key))}\n" for key, about in keys.items()
     )
 
 
@@ -705,17 +681,6 @@ def _toml(value: Any) -> str:
         return f"[{', '.join(_toml(one) for one in value)}]"
     # Texts have no control characters, so their JSON strings are valid TOML strings.
     return json.dumps(value, ensure_ascii=False)
-
-
-def settings_table() -> str:
-    """Return the Markdown table of all keys for the documentation."""
-    rows = []
-    for key in all_keys():
-        name = f"{key.table}.{key.name}" if key.table else key.name
-        default = "" if key.default is None else f"`{_toml(key.default)}`"
-        rows.append((f"`{name}`", default, key.about))
-    table = markdown_table(["key", "default", "meaning"], rows, tight=True)
-    return table.replace(" |  | ", " | | ") + "\n"
 
 
 # --- answers to questions ------------------------------------------------------------------------
