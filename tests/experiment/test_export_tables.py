@@ -164,17 +164,19 @@ def test_rows_are_in_the_order_of_time(engine: sa.Engine, study: Study) -> None:
             assert list(phase["trial"]) == list(range(len(phase)))
 
 
-def test_kinds_scenario_and_finished_can_be_chosen(engine: sa.Engine, study: Study) -> None:
-    trials, sessions = read_tables(engine, study, kinds=("person",), finished_only=True)
-    assert not trials["simulated"].any() and not sessions["simulated"].any()
-    assert (sessions["finished_at"] != "").all()
-    trials, sessions = read_tables(engine, study, kinds=("simulated",), scenario="drop")
-    assert trials["simulated"].all() and set(trials["scenario"]) == {"drop"}
-    assert set(sessions["scenario"]) == {"drop"}
-    with pytest.raises(UnknownNameError, match="kind"):
-        read_tables(engine, study, kinds=("preview",))
-    with pytest.raises(UnknownNameError, match="collide"):
-        read_tables(engine, study, scenario="colide")
+def test_kinds_and_scenario_can_be_chosen(engine: sa.Engine, study: Study) -> None:
+    with snapshot(engine) as connection:
+        people = read_sessions(connection, study, SessionSelection(("person",)))
+        assert people.table.num_rows and not any(people.table["simulated"].to_pylist())
+        chosen = read_sessions(connection, study, SessionSelection(("simulated",), "drop"))
+        assert set(chosen.table["scenario"].to_pylist()) == {"drop"}
+        parts = list(read_trials(connection, study, chosen.table))
+        for table in (chosen.table, *(part.table for part in parts)):
+            assert table.num_rows and all(table["simulated"].to_pylist())
+        with pytest.raises(UnknownNameError, match="kind"):
+            read_sessions(connection, study, SessionSelection(("preview",)))
+        with pytest.raises(UnknownNameError, match="collide"):
+            read_sessions(connection, study, SessionSelection(scenario="colide"))
 
 
 def test_cells_that_are_not_known_are_empty(study: Study, database: Path) -> None:
@@ -231,7 +233,7 @@ def test_what_is_written_meanwhile_is_not_seen(
     before, _ = read_tables(engine, study)
     seen = 0
     with snapshot(engine) as connection:
-        sessions = read_sessions(connection, study, SessionSelection())
+        sessions = read_sessions(connection, study)
         for number, part in enumerate(read_trials(connection, study, sessions.table)):
             seen += part.table.num_rows
             if number == 0:
@@ -252,7 +254,7 @@ def test_answers_to_stimuli_that_are_gone_are_named(engine: sa.Engine, study: St
     with pytest.raises(PhysionError, match="the first to gone"):
         read_tables(engine, study)
     with snapshot(engine) as connection:
-        sessions = read_sessions(connection, study, SessionSelection())
+        sessions = read_sessions(connection, study)
         parts = list(read_trials(connection, study, sessions.table))
     assert {name for part in parts for name in part.unknown} == {"gone"}
     assert sum(len(part.unknown) for part in parts) > 20

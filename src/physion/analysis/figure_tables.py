@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
 from physion.analysis.compare import PeopleComparison
@@ -21,8 +20,6 @@ from physion.analysis.statistics.agreement import pearson
 from physion.analysis.tables import ALL_BUT, DETECTION, MEAN, ONLY, POOLED, READOUTS, in_order
 from physion.analysis.with_participants import released_zone
 from physion.core.names import SCENARIOS
-
-Array = npt.NDArray[np.float64]
 
 PARTICIPANTS = "95 % of participants"
 HALVES = "95 % of random halves"

@@ -35,7 +35,7 @@ from physion.analysis.people.measures import (
 from physion.analysis.sample import RESAMPLED, Resampled, Sample
 from physion.analysis.scores import MAJORITY, OUTCOME
 from physion.analysis.statistics import agreement
-from physion.analysis.statistics.agreement import correctness, correlate_rows, cross_kappa, rmsd
+from physion.analysis.statistics.agreement import correctness, correlate_rows, cross_kappa
 from physion.analysis.tables import MEAN
 from physion.core.errors import BadInputError
 from physion.core.seeds import generator
@@ -540,7 +540,7 @@ def human_zones(answers: ScenarioAnswers, halves: Array | None = None) -> pd.Dat
     kappa, errors = cross_kappa(yes, yes), cross_kappa(right, right)
     for matrix in (kappa, errors):
         np.fill_diagonal(matrix, np.nan)
-    distances = [rmsd_of(first, second) for first, second in zip(yes, others, strict=True)]
+    distances = np.sqrt(mean_over_people((yes - others).T ** 2))
     upper = np.triu_indices(n, 1)
     ranges: list[tuple[str, str, npt.ArrayLike]] = [
         ("accuracy", "participants", mean_over_people(right.T)),
@@ -560,12 +560,6 @@ def human_zones(answers: ScenarioAnswers, halves: Array | None = None) -> pd.Dat
             for measure, of, values in ranges
         ]
     )
-
-
-def rmsd_of(first: Array, second: Array) -> float:
-    """Return the RMSD of two vectors where both are finite."""
-    known = np.isfinite(first) & np.isfinite(second)
-    return rmsd(first[known], second[known])
 
 
 def released_zone(

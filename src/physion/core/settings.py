@@ -222,14 +222,14 @@ def flatten(values: Mapping[Any, Any], *, lists: bool = False) -> dict[str, Any]
         parts: Any = None
         if isinstance(value, Mapping):
             parts = {f"{key}.{name}": part for name, part in value.items()}
-        elif lists and isinstance(value, list) and any(map(_is_nested, value)):
+        elif (
+            lists
+            and isinstance(value, list)
+            and any(isinstance(one, Mapping | list) for one in value)
+        ):
             parts = {f"{key}[{place}]": part for place, part in enumerate(value)}
         flat |= {str(key): value} if parts is None else flatten(parts, lists=lists)
     return flat
-
-
-def _is_nested(value: Any) -> bool:
-    return isinstance(value, Mapping | list)
 
 
 def as_json(values: Any, default: Callable[[Any], Any] | None = None) -> Any:

@@ -21,7 +21,7 @@ Learning"; docs/reference/vision-models.md says in what the sizes differ from th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, ClassVar, Literal
@@ -557,9 +557,6 @@ def _log_variance(raw: Tensor) -> Tensor:
 
 
 # The model: loss, and imagination.
-
-Noise = Callable[[], Tensor]
-"""Function that gives standard normal numbers (B, K, Rs), new ones at every call."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,8 +19,6 @@ from physion.numerics.linear_algebra import apply, multiply, norm, unit
 from physion.scenes.scene import Camera
 
 F64 = NDArray[np.float64]
-F32 = NDArray[np.float32]
-I32 = NDArray[np.int32]
 
 
 def axes(camera: Camera) -> F64:

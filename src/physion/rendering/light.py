@@ -25,7 +25,6 @@ from physion.rendering.rooms import Room
 from physion.rendering.shading import TONES, WHITEST
 from physion.scenes.scene import Scene
 
-F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 U8 = NDArray[np.uint8]

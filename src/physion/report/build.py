@@ -67,13 +67,8 @@ def write_csv(path: Path, table: pd.DataFrame, rehearsal: bool = False) -> None:
 
     ``rehearsal``: the participants are simulated, which every row then states.
     """
-    marked = mark_rehearsal(table) if rehearsal else table
+    marked = table.assign(rehearsal="simulated participants") if rehearsal else table
     write_atomic(path, marked.to_csv(index=False, lineterminator="\n").encode())
-
-
-def mark_rehearsal(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the table with the column ``rehearsal``, which states that nothing is about people."""
-    return table.assign(rehearsal="simulated participants")
 
 
 def build_people_report(report: PeopleReport, folder: Path) -> Path:

@@ -91,7 +91,6 @@ def plain(
     mean = float(np.nanmean([kappa(row, said) for row in yes]))
     among = [kappa(yes[i], yes[j]) for i in range(len(who)) for j in range(i)
              if who[i] != who[j]]  # fmt: skip
-    rmsd = agreement.rmsd(p, share)
     agreeing = np.mean(np.where(said == 1, share, 1 - share))
     by_chance = said.mean() * share.mean() + (1 - said.mean()) * (1 - share.mean())
     average = float((agreeing - by_chance) / (1 - by_chance))
@@ -106,7 +105,7 @@ def plain(
         "accuracy": float(np.mean(said == label)),
         "difference": float(np.mean(said == label) - np.mean(right)),
         "r": agreement.pearson(p, share),
-        "rmsd": rmsd,
+        "rmsd": np.sqrt(np.mean((p - share) ** 2)),
         "euclid_over_n": float(np.sqrt(np.sum((p - share) ** 2)) / len(p)),
         "kappa": mean,
         "kappa_gap": mean - float(np.nanmean(among)),

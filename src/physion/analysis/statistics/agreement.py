@@ -35,15 +35,6 @@ def pearson(x: npt.ArrayLike, y: npt.ArrayLike) -> float:
     return float(correlation_from_sums(np.float64(len(a)), *map(np.float64, sums)))
 
 
-def rmsd(x: npt.ArrayLike, y: npt.ArrayLike) -> float:
-    """Return the root of the mean squared difference; NaN for empty arrays.
-
-    The "RMSE" of the released notebooks is this divided by sqrt(n).
-    """
-    difference = np.asarray(x, dtype=np.float64) - np.asarray(y, dtype=np.float64)
-    return float(np.sqrt(np.mean(difference**2))) if len(difference) else float("nan")
-
-
 def sampling_variance(y: npt.ArrayLike, count: npt.ArrayLike) -> Array:
     """Return the variance of a fraction of yes due to only ``count`` people having answered, (n,).
 
@@ -65,15 +56,14 @@ def pair_difference(y: npt.ArrayLike, count: npt.ArrayLike) -> Array:
     return 2 * np.asarray(count, dtype=np.float64) * sampling_variance(y, count)
 
 
-def reliability(y: npt.ArrayLike, count: npt.ArrayLike, people: float | None = None) -> float:
+def reliability(y: npt.ArrayLike, count: npt.ArrayLike) -> float:
     """Return the expected r of the average of these people with the average of as many others.
 
     Per-stimulus tables contain no single answers and thus no split halves; instead the variance
     over stimuli is split into the binomial one (`sampling_variance`) and the rest: reliability =
-    rest / (rest + binomial). ``people`` gives another size of the groups (half of the count
-    corresponds to the official split halves). Answers of one person are assumed to be independent,
-    given the stimulus. NaN if people's answers are constant, only one person answered, or the
-    binomial variance exceeds the total.
+    rest / (rest + binomial). Answers of one person are assumed to be independent, given the
+    stimulus. NaN if people's answers are constant, only one person answered, or the binomial
+    variance exceeds the total.
     """
     fraction = np.asarray(y, dtype=np.float64)
     if len(fraction) < FEWEST:
@@ -83,8 +73,6 @@ def reliability(y: npt.ArrayLike, count: npt.ArrayLike, people: float | None = N
     true = total - noise
     if not true > CONSTANT**2:
         return float("nan")
-    if people is not None:
-        noise *= float(np.mean(np.asarray(count, dtype=np.float64))) / people
     return true / (true + noise)
 
 
@@ -226,18 +214,12 @@ def as_answers(answers: npt.ArrayLike, what: str = "answers") -> Array:
     return values
 
 
-def cross_kappa(
-    first: npt.ArrayLike, second: npt.ArrayLike, weights: npt.ArrayLike | None = None
-) -> Array:
-    """Return kappa of every rater of ``first`` (n, stimuli) with every one of ``second``: (n, m).
-
-    ``weights`` (stimuli,) counts how often each stimulus is in the sample, as in a bootstrap draw.
-    """
+def cross_kappa(first: npt.ArrayLike, second: npt.ArrayLike) -> Array:
+    """Return kappa of every rater of ``first`` (n, stimuli) with each of ``second``: (n, m)."""
     a, b = as_answers(first, "first answers"), as_answers(second, "second answers")
     if a.shape[1] != b.shape[1]:
         raise BadInputError(f"answers to {a.shape[1]} and to {b.shape[1]} stimuli cannot be paired")
-    counted = np.ones(a.shape[1]) if weights is None else np.asarray(weights, dtype=np.float64)
-    return _kappa(_split(a), _split(b), counted)
+    return _kappa(_split(a), _split(b), np.ones(a.shape[1]))
 
 
 def pairwise_kappa(answers: npt.ArrayLike) -> Array:

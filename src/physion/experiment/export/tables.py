@@ -181,7 +181,6 @@ EXPORTED_KINDS = ("person", "simulated")
 PREVIEW = "preview by the experimenter"
 VOID = "the experimenter made the session void"
 WITHDRAWN = "the participant withdrew"
-UNFINISHED = "not finished, and only finished ones were requested"
 OTHER_KIND = "{kind}, which was not requested"
 GONE_SCENARIO = "of {scenario}, which study.toml no longer has: add it again to export them"
 OTHER_SCENARIO = "of a scenario that was not requested"
@@ -191,11 +190,10 @@ _Row = Any
 
 @dataclass(frozen=True)
 class SessionSelection:
-    """Which sessions to export: kinds, one scenario (None: all), only finished ones or all."""
+    """Which sessions to export: kinds, and one scenario (None: all)."""
 
     kinds: Sequence[str] = EXPORTED_KINDS
     scenario: str | None = None
-    finished_only: bool = False
 
 
 @dataclass(frozen=True)
@@ -267,8 +265,6 @@ def _why_not(row: _Row, wanted: SessionSelection, study: Study) -> str | None:
         return WITHDRAWN
     if row.scenario not in study.scenarios:
         return GONE_SCENARIO.format(scenario=row.scenario)
-    if wanted.finished_only and end != "finished":
-        return UNFINISHED
     return None
 
 
@@ -507,30 +503,11 @@ def _table(
 # --- the data of a study as two data frames ---
 
 
-def read_tables(
-    engine: Engine,
-    study: Study,
-    *,
-    kinds: Sequence[str] = EXPORTED_KINDS,
-    scenario: str | None = None,
-    finished_only: bool = False,
-) -> tuple[pd.DataFrame, pd.DataFrame]:
+def read_tables(engine: Engine, study: Study) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Read trials and sessions from one consistent snapshot of the database.
 
-    Sessions without consent and of participants who withdrew are left out.
-
-    Parameters
-    ----------
-    engine
-        The database.
-    study
-        The study, for the labels of its stimuli.
-    kinds
-        Kinds of sessions to include: ``person``, ``simulated`` or both.
-    scenario
-        Include only this scenario.
-    finished_only
-        Include only finished sessions.
+    Sessions without consent and of participants who withdrew are left out. ``study``: for the
+    labels of its stimuli.
 
     Returns
     -------
@@ -543,9 +520,7 @@ def read_tables(
         There are answers to stimuli that the study folder no longer has.
     """
     with snapshot(engine) as connection:
-        sessions = read_sessions(
-            connection, study, SessionSelection(kinds, scenario, finished_only)
-        )
+        sessions = read_sessions(connection, study)
         parts = list(read_trials(connection, study, sessions.table))
     unknown = [name for part in parts for name in part.unknown]
     if unknown:

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from physion.clips.batch import AGENT_ID, PATIENT_ID, SCENERY_ID
-from physion.models.checkpoint import load_packaged, packaged_sha256
+from physion.models.checkpoint import load_packaged
 from physion.models.seeing.masks import Expected
 from physion.models.seeing.pixels import SeenFrame, picture_of
 from physion.models.seeing.solids import library
@@ -296,11 +296,6 @@ def split(out: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 def _network(depth: bool) -> ExpectationNetwork:
     """Return the network with the weights of the package."""
     return load_packaged(partial(ExpectationNetwork, depth=depth), FOLDER, WEIGHTS[depth])
-
-
-def weights_sha256(*, depth: bool) -> str:
-    """Return the SHA-256 of the weights of the package."""
-    return packaged_sha256(FOLDER, WEIGHTS[depth])
 
 
 def assumed_depth(ids: NDArray[np.uint8], camera: F64) -> F64:

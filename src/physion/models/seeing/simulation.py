@@ -184,10 +184,11 @@ class SeeingSimulation(Model):
 
     def _weights(self) -> str:
         """Return the SHA-256 of the weights that fits without exact depth need."""
-        # Imported late: it needs torch, which exact depth does not.
-        from physion.models.seeing.expected import weights_sha256
+        # Imported late: they need torch, which exact depth does not.
+        from physion.models.checkpoint import packaged_sha256
+        from physion.models.seeing.expected import FOLDER, WEIGHTS
 
-        return weights_sha256(depth=self.settings.depth)
+        return packaged_sha256(FOLDER, WEIGHTS[self.settings.depth])
 
     def _see(self, context: Batch, row: int) -> SeenTrial:
         """Return what is seen of a trial; the last ones are remembered."""

@@ -605,9 +605,6 @@ def _substitute_prop(model: str) -> str:
 # assigned in order, as this package exports them; otherwise each pair gets the point that is
 # nearest to both of its bounding boxes.
 
-Row = tuple[int, int, int, Floats, Floats]
-"""Frame, first and second body, point, normal from first to second."""
-
 MAX_RESOLUTION = 101
 _NEAR = 50.0
 """Depth in metres from which pixels say nothing about the rows of a picture."""

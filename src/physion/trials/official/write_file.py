@@ -51,7 +51,6 @@ from physion.trials.official.write_objects import (
     OfficialObjects,
     ParticleArrays,
     flex_groups,
-    in_memory_file,
     link,
     model_name,
     new_group,
@@ -398,7 +397,8 @@ def official_file(
     """
     meta, scene = trial.metadata, trial.shown(look)
     objects = OfficialObjects(scene, trial.trajectory)
-    with in_memory_file() as file:
+    # In memory, because a full disk would crash the HDF5 library.
+    with h5py.File("official", "w", driver="core", backing_store=False, block_size=2**22) as file:
         static = _static(trial, objects, look or meta.look)
         _write_static(file.create_group("static"), static, objects)
         frames = file.create_group("frames")

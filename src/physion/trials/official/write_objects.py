@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any
 
-import h5py
 import numpy as np
 from h5py import h5d, h5g, h5o, h5p, h5s, h5t
 from numpy.typing import NDArray
@@ -364,11 +363,6 @@ def _compressed(shape: tuple[int, ...], shuffle: bool = True) -> Any:
         layout.set_shuffle()
     layout.set_deflate(GZIP_LEVEL)
     return layout
-
-
-def in_memory_file() -> h5py.File:
-    """Return a new HDF5 file in memory, because a full disk would crash the HDF5 library."""
-    return h5py.File("official", "w", driver="core", backing_store=False, block_size=2**22)
 
 
 # Groups ``collisions`` and ``env_collisions`` of the frames of an official file.
