@@ -139,7 +139,14 @@ class MovieDecoder:
 
 @contextmanager
 def open_movie(path: Path) -> Iterator[MovieDecoder]:
-    """Open a movie for decoding; `BadInputError` if it is missing, damaged or without pictures."""
+    """Open a movie for decoding; raise as `open_container`."""
+    with open_container(path) as container:
+        yield MovieDecoder(path, container)
+
+
+@contextmanager
+def open_container(path: Path) -> Iterator[Any]:
+    """Open a movie as av does; `BadInputError` if it is missing, damaged or without pictures."""
     if not path.is_file():
         raise BadInputError(f"movie {path} is missing")
     try:
@@ -150,7 +157,7 @@ def open_movie(path: Path) -> Iterator[MovieDecoder]:
         # A stream whose header is damaged can lack a codec.
         if not container.streams.video or container.streams.video[0].codec_context is None:
             raise BadInputError(f"movie {path} holds no pictures")
-        yield MovieDecoder(path, container)
+        yield container
 
 
 def _decode_packets(packets: Iterable[Any]) -> Iterator[av.VideoFrame]:

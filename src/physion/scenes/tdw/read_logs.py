@@ -86,15 +86,14 @@ class ImportedTrial:
 class TrialSet:
     """Result of importing a folder.
 
-    ``unknown`` counts the commands that the importer does not know, ``unrecorded`` the trials
-    without an outcome in ``metadata.json``, ``logs`` are the files of the trials by name.
+    ``unknown`` counts the commands that the importer does not know, ``logs`` are the files of the
+    trials by name. Trials without an outcome in ``metadata.json`` are left out.
     """
 
     trials: list[ImportedTrial] = field(default_factory=list)
     logs: dict[str, list[Path]] = field(default_factory=dict)
     failures: list[ImportFailure] = field(default_factory=list)
     unknown: Counter[str] = field(default_factory=Counter)
-    unrecorded: int = 0
 
     def require_trials(self) -> None:
         """Raise `BadInputError` with the first failure if nothing was imported."""
@@ -162,7 +161,6 @@ def read_log(
         try:
             if tag not in records:
                 # Logs of familiarization trials contain more trials than were used.
-                result.unrecorded += 1
                 continue
             commands = CommandReader(result.unknown)
             commands.read(log.setup, frames)

@@ -22,7 +22,7 @@ from physion.core.errors import BadInputError
 from physion.scenes.scene import OBSERVED_FRAMES
 from physion.trials.files import MAX_FRAMES, MAX_SIDE
 from physion.trials.official.read_file import OfficialFile
-from physion.trials.video import MovieEncoder
+from physion.trials.video import MovieEncoder, open_container
 
 _BT709 = 1
 _MPEG_RANGES = (0, 1)
@@ -52,7 +52,7 @@ class SourceMovie:
         self.path = path
         if path.is_symlink() or not path.is_file():
             raise BadInputError(f"movie {path} is not a regular file")
-        with self._open() as container:
+        with open_container(path) as container:
             stream: Any = container.streams.video[0]
             context = stream.codec_context
             self.width, self.height = int(context.width), int(context.height)
@@ -71,7 +71,7 @@ class SourceMovie:
     def frames(self) -> Iterator[NDArray[np.uint8]]:
         """Yield all frames (H, W, 3) in sRGB."""
         reformatter = VideoReformatter()
-        with self._open() as container:
+        with open_container(self.path) as container:
             stream = container.streams.video[0]
             stream.codec_context.thread_count = 1
             try:
@@ -86,16 +86,6 @@ class SourceMovie:
                     yield rgb.to_ndarray()  # type: ignore[misc]
             except av.FFmpegError as error:
                 raise BadInputError(f"movie {self.path} is damaged: {error}") from error
-
-    def _open(self) -> Any:
-        try:
-            container = av.open(str(self.path), metadata_errors="replace")
-        except (av.FFmpegError, ValueError) as error:
-            raise BadInputError(f"movie {self.path} cannot be read: {error}") from error
-        if not container.streams.video or container.streams.video[0].codec_context is None:
-            container.close()
-            raise BadInputError(f"movie {self.path} holds no pictures")
-        return container
 
 
 @dataclass(frozen=True)
