@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from physion.core.registry import Registry
 from physion.numerics.linear_algebra import norm
-from physion.scenes.scene import Vec3
+from physion.scenes.scene import Vec3, vec3
 
 F64 = NDArray[np.float64]
 Rect = tuple[float, float, float, float]
@@ -106,16 +106,11 @@ def _wall_panels(wall: Wall, openings: Sequence[Rect], **surface: object) -> Ite
             if any(o[0] <= a and b <= o[1] and o[2] <= c and d <= o[3] for o in openings):
                 continue
             yield Panel(
-                _vec(corner + a * u + c * v),
-                _vec((b - a) * u),
-                _vec((d - c) * v),
+                vec3(corner + a * u + c * v),
+                vec3((b - a) * u),
+                vec3((d - c) * v),
                 **surface,  # type: ignore[arg-type]
             )
-
-
-def _vec(value: np.ndarray) -> Vec3:
-    """Return an array (3,) as a tuple of floats."""
-    return (float(value[0]), float(value[1]), float(value[2]))
 
 
 def _reveal(wall: Wall, opening: Rect, depth: float, **surface: object) -> Iterator[Panel]:
@@ -126,7 +121,7 @@ def _reveal(wall: Wall, opening: Rect, depth: float, **surface: object) -> Itera
     p = [corner + x * u + y * v for x, y in ((a, c), (b, c), (b, d), (a, d))]
     for i in range(4):
         side = p[(i + 1) % 4] - p[i]
-        yield Panel(_vec(p[i]), _vec(side), _vec(back), **surface)  # type: ignore[arg-type]
+        yield Panel(vec3(p[i]), vec3(side), vec3(back), **surface)  # type: ignore[arg-type]
 
 
 def _slab(low: Vec3, high: Vec3, **surface: object) -> Iterator[Panel]:
@@ -136,7 +131,7 @@ def _slab(low: Vec3, high: Vec3, **surface: object) -> Iterator[Panel]:
     for corner, u, v in (
         (a, y, x), (a, x, z), (a, z, y), (b, -x, -y), (b, -z, -x), (b, -y, -z),
     ):  # fmt: skip
-        yield Panel(_vec(corner), _vec(u), _vec(v), **surface)  # type: ignore[arg-type]
+        yield Panel(vec3(corner), vec3(u), vec3(v), **surface)  # type: ignore[arg-type]
 
 
 def _four_walls(half_x: float, half_y: float, height: float, floor: float = 0.0) -> list[Wall]:
@@ -213,8 +208,8 @@ def _pane(wall: Wall, opening: Rect, depth: float, color: Vec3, emission: float)
     corner, u, v, _, _ = wall.arrays()
     a, b, c, d = opening
     start = corner + a * u + c * v - depth * np.cross(u, v)
-    across, upward = _vec((b - a) * u), _vec((d - c) * v)
-    return Panel(_vec(start), across, upward, color, "glow", 2.0, emission, False)
+    across, upward = vec3((b - a) * u), vec3((d - c) * v)
+    return Panel(vec3(start), across, upward, color, "glow", 2.0, emission, False)
 
 
 def _bright_room() -> Room:

@@ -16,12 +16,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
+import numpy as np
+from numpy.typing import NDArray
+
 from physion.core.errors import BadInputError, BadSceneError
 from physion.core.files import digest_of
 from physion.core.settings import parse_json, read_settings, shown
 
 Vec3: TypeAlias = tuple[float, float, float]
 Quat: TypeAlias = tuple[float, float, float, float]
+
+
+def vec3(values: NDArray[np.float64]) -> Vec3:
+    """Return an array (3,) as a tuple of floats."""
+    return (float(values[0]), float(values[1]), float(values[2]))
+
 
 FRAME_TIME = 0.01
 """Seconds of physics per frame (docs/official-system.md, section 1)."""

@@ -59,7 +59,16 @@ from physion.physics.engine import Engine, simulate
 from physion.physics.labels import label_contact
 from physion.physics.trajectory import State, Trajectory
 from physion.rendering.renderer import Renderer
-from physion.scenes.scene import FRAME_TIME, GRAVITY, OBSERVED_FRAMES, Ending, Push, Roles, Scene
+from physion.scenes.scene import (
+    FRAME_TIME,
+    GRAVITY,
+    OBSERVED_FRAMES,
+    Ending,
+    Push,
+    Roles,
+    Scene,
+    vec3,
+)
 
 F64 = NDArray[np.float64]
 Ids = NDArray[np.uint8]
@@ -256,7 +265,7 @@ class PushGuess:
         point[2] += np.clip(over, -0.5, 0.5) * size[2]
         impulse = mass * velocity
         frame = int(np.clip(round(frame), 0, LAST_OBSERVED - 1))
-        return Push(str(self.number), _triple(impulse), _triple(point), frame), mass
+        return Push(str(self.number), vec3(impulse), vec3(point), frame), mass
 
 
 def see_uncertain(
@@ -569,7 +578,3 @@ def _refitted(one: Resting, start: Placed, rays: Rays, axis: F64 | None) -> Plac
         fit = MaskFit(rays, one.fit.error, None, False, "given", factor, deviation)
         found.append(fit.solve(guess, 8))
     return min(found, key=lambda placed: placed.cost)
-
-
-def _triple(values: F64) -> tuple[float, float, float]:
-    return (float(values[0]), float(values[1]), float(values[2]))

@@ -61,6 +61,7 @@ from physion.scenes.scene import (
     Roles,
     Scene,
     SurfaceMaterial,
+    vec3,
 )
 
 F64 = NDArray[np.float64]
@@ -554,7 +555,7 @@ def camera_of(matrices: F64) -> Camera:
     view, projection = matrices
     origin = -view[:3, :3].T @ view[:3, 3]
     angle = 2 * math.atan(1 / abs(float(projection[1, 1])))
-    return Camera(_vec3(origin), _vec3(origin + view[2, :3]), angle)
+    return Camera(vec3(origin), vec3(origin + view[2, :3]), angle)
 
 
 def _last(track: Track, tracks: Sequence[Track], floor: float) -> tuple[Placed, F64, F64]:
@@ -605,8 +606,8 @@ def body_of(number: int, placed: Placed, floor: float) -> Body:
     return Body(
         str(number),
         placed.solid.name,
-        _vec3(placed.position),
-        _vec3(placed.scale),
+        vec3(placed.position),
+        vec3(placed.scale),
         _quaternion(placed.rotation),
         max(1e-3, density * float(np.prod(placed.scale))),
         surface,
@@ -682,10 +683,6 @@ def _touched(tracks: Sequence[Track]) -> bool:
         if gap(turn, shift) < TOUCHING:
             return True
     return False
-
-
-def _vec3(values: F64) -> tuple[float, float, float]:
-    return (float(values[0]), float(values[1]), float(values[2]))
 
 
 def _quaternion(matrix: F64) -> tuple[float, float, float, float]:

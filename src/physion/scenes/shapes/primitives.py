@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.registry import Registry
 from physion.numerics.elementary import arctan2, cos, sin
-from physion.scenes.scene import Vec3
+from physion.scenes.scene import Vec3, vec3
 from physion.scenes.shapes.meshes import Mesh, Points, box, extrude, hull, revolve, solid_properties
 
 # Names and categories of props, and the prop that replaces each official library model.
@@ -330,7 +330,7 @@ def convex(points: NDArray[np.float64]) -> ConvexPiece:
     corners = hull(points).vertices
     low, high = corners.min(axis=0), corners.max(axis=0)
     center, half = (low + high) / 2, (high - low) / 2
-    return ConvexPiece("convex", _vec3(center), _vec3(half), corners, np.eye(3))
+    return ConvexPiece("convex", vec3(center), vec3(half), corners, np.eye(3))
 
 
 def ball_mesh(radius: float, segments: int = ROUND_SEGMENTS) -> Mesh:
@@ -541,7 +541,3 @@ def _solid(name: str, mesh: Mesh) -> Shape:
 
 def _square(half: float, height: float) -> list[Vec3]:
     return [(x, y, height) for x in (-half, half) for y in (-half, half)]
-
-
-def _vec3(values: NDArray[np.float64]) -> Vec3:
-    return (float(values[0]), float(values[1]), float(values[2]))
