@@ -179,7 +179,7 @@ def test_later_steps_weigh_more_and_missing_frames_do_not_count() -> None:
     for frame, row in zip((0, 0, 1), likelihoods, strict=True):
         pixels = row[:, None, None].expand(2, 4, 4)
         known = Likelihood(pixels, pixels)
-        steps.append((frame, Explained(slots, random_decoded(), known, row, -row, row)))
+        steps.append((frame, Explained(slots, random_decoded(), known, -row, row)))
     valid = torch.tensor([[True, True], [True, False]])
     weights = torch.ones(2, 2, 4, 4)
     weights[1, 0] = 2

@@ -150,9 +150,9 @@ def test_spacing_is_finer_with_cloth() -> None:
 
 def test_frames_can_be_chosen() -> None:
     scene, trajectory = _turning_scene()
-    some = particles_over_time(scene, trajectory, SPACING, frames=[2, 0])
-    every = particles_over_time(scene, trajectory, SPACING)
+    some = particles_over_time(scene, trajectory, frames=[2, 0])
+    every = particles_over_time(scene, trajectory)
     np.testing.assert_array_equal(some.positions, every.positions[[2, 0]])
     assert some.frames.tolist() == [2, 0]
     with pytest.raises(BadInputError, match=r"0\.\.2"):
-        particles_over_time(scene, trajectory, SPACING, frames=[3])
+        particles_over_time(scene, trajectory, frames=[3])

@@ -23,7 +23,7 @@ from physion.analysis.model_tests import (
     paired_tests,
     pool_comparison,
 )
-from physion.analysis.people.measures import HALVES, accuracy_by_stimulus, all_answers, split_halves
+from physion.analysis.people.measures import accuracy_by_stimulus, all_answers, split_halves
 from physion.analysis.people.results import PeopleResults
 from physion.analysis.population import PopulationResults, compare_populations
 from physion.analysis.scores import TWO_PEOPLE, against_people, with_kind
@@ -68,8 +68,6 @@ def compare_everywhere(
     predictions: pd.DataFrame,
     test: pd.DataFrame,
     bootstrap: Bootstrap | None = None,
-    *,
-    halves: int = HALVES,
 ) -> PeopleComparison:
     """Compare the models of ``predictions`` with the people of ``test`` in every scenario.
 
@@ -81,9 +79,7 @@ def compare_everywhere(
     test
         Test rows of `Responses`.
     bootstrap
-        Level of the intervals, draws of participants, and seed of the halves.
-    halves
-        Number of random splits of the people into halves.
+        Draws of participants, and the seed of the halves.
     """
     columns = ["model", "stimulus", "p_contact", "predicted"]
     require_columns(predictions, columns, "the predictions")
@@ -98,7 +94,7 @@ def compare_everywhere(
         models, unmatched = models_of(subset, answers, names)
         dropped.append(unmatched.assign(scenario=answers.scenario))
         measured.append(measure_models(add_baselines(models, answers), answers, TWO_PEOPLE, draws))
-        zones.append(human_zones(answers, split_halves(answers.yes, halves, draws.seed)))
+        zones.append(human_zones(answers, split_halves(answers.yes, seed=draws.seed)))
         pairs.append(model_pairs(models, answers).assign(scenario=answers.scenario))
     zone = pd.concat(zones, ignore_index=True)
     if len(measured) > 1:

@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from physion.cli.output import print_line
+from physion.compute.local import available_cores
 from physion.core.errors import BadInputError
 from physion.core.version import __version__
 
@@ -79,7 +80,6 @@ def main(options: Options) -> int:
 
 def machine() -> list[Check]:
     """Check Python, processor cores and memory."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     pages = os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 0
     gigabytes = pages * os.sysconf("SC_PAGE_SIZE") / 2**30 if pages else float("nan")
     version = platform.python_version()
@@ -88,7 +88,7 @@ def machine() -> list[Check]:
         Check("physion", __version__),
         Check("python", version, fresh, remedy="" if fresh else "install Python 3.11 or newer"),
         Check("system", platform.platform()),
-        Check("cores", str(cores)),
+        Check("cores", str(available_cores())),
         Check("memory", f"{gigabytes:.1f} GiB"),
     ]
 

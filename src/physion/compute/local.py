@@ -246,7 +246,7 @@ def _prepare() -> None:
 
 @contextlib.contextmanager
 def _interrupts_blocked() -> Iterator[None]:
-    """Start child processes with Ctrl-C blocked, until they ignore it (`_serve`).
+    """Start child processes with Ctrl-C blocked, until they ignore it (`_prepare`).
 
     Otherwise Ctrl-C while a child imports would print the child's traceback. This process handles
     one that comes in the meantime at the end of the block.

@@ -473,14 +473,13 @@ class Slots:
 class Explained:
     """What slots show, and how well it explains a picture.
 
-    ``nll``, ``kl`` (B): negative log likelihood, summed over pixels, and divergence. ``objective``
-    (B): their weighted sum.
+    ``kl`` (B): divergence. ``objective`` (B): weighted sum of the divergence and of the negative
+    log likelihood, which is summed over pixels.
     """
 
     slots: Slots
     decoded: Decoded
     likelihood: Likelihood
-    nll: Tensor
     kl: Tensor
     objective: Tensor
 
@@ -513,7 +512,7 @@ class SlotInference(nn.Module):
         decoded = self.decoder(slots.states)
         likelihood = log_likelihood(decoded, pictures, settings.sigma, settings.density)
         nll, kl = -likelihood.pixels.sum((1, 2)), slots.divergence()
-        return Explained(slots, decoded, likelihood, nll, kl, nll + settings.beta * kl)
+        return Explained(slots, decoded, likelihood, kl, nll + settings.beta * kl)
 
     def refine(self, explained: Explained, pictures: Tensor, noise: Tensor) -> Slots:
         """Return the beliefs after one refinement; ``noise`` (B, K, Rs) makes their samples.

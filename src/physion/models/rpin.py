@@ -31,7 +31,12 @@ from physion.core.errors import BadInputError
 from physion.models.checkpoint import load_named
 from physion.models.interface import Sizes, TrainingSettings
 from physion.models.torch_model import initial_weights
-from physion.models.vision import VisionModel, VisionSettings, normalized_pictures
+from physion.models.vision import (
+    VisionModel,
+    VisionSettings,
+    mean_of_counted,
+    normalized_pictures,
+)
 
 NAME, VERSION = "rpin", 1
 
@@ -568,7 +573,7 @@ class Rpin(VisionModel):
         apart = functional.smooth_l1_loss(
             predicted / UNIT, targets.boxes / UNIT, reduction="none"
         ).sum(-1)
-        return _mean(apart, targets.counted)
+        return mean_of_counted(apart, targets.counted)
 
     def _published(self, imagined: RolledOut, last: Tensor, targets: Targets) -> Tensor:
         """Return the published loss; ``last`` are the last known boxes (B, 1, K, 4)."""
@@ -580,7 +585,7 @@ class Rpin(VisionModel):
             settings.offset_weight * (offset - (true - before)).pow(2)
             + settings.position_weight * (position - true).pow(2)
         ).sum(-1)
-        return _mean(errors, targets.counted)
+        return mean_of_counted(errors, targets.counted)
 
     def _task(self, batch: Batch) -> tuple[Tensor, Targets]:
         """Return the boxes of the first h frames, and what follows them."""
@@ -634,9 +639,3 @@ class Rpin(VisionModel):
         cells = (settings.width, settings.pool, settings.pool)
         objects = features.view(*features.shape[:2], settings.objects, -1)
         return objects[..., :-4].reshape(*objects.shape[:3], *cells), objects[..., -4:]
-
-
-def _mean(values: Tensor, counted: Tensor) -> Tensor:
-    """Return the mean of the values that count; 0 if none does."""
-    total: Tensor = (values * counted).sum()
-    return total / counted.sum().clamp(min=1)

@@ -174,7 +174,7 @@ def future_error(predicted: Tensor, pictures: Tensor, valid: Tensor) -> FutureEr
     squares = (predicted - pictures[:, -future:]).pow(2).mean(2)
     counted = valid[:, -future:, None, None].expand_as(squares)
     moves = moving_pixels(pictures[:, -future - 1 :]) & counted
-    return FutureError(_mean(squares, moves), _mean(squares, counted))
+    return FutureError(mean_of_counted(squares, moves), mean_of_counted(squares, counted))
 
 
 def copy_error(pictures: Tensor, future: int, valid: Tensor) -> FutureError:
@@ -192,7 +192,8 @@ def empty_scene_error(pictures: Tensor, future: int, valid: Tensor) -> FutureErr
     return future_error(median.expand(-1, future, -1, -1, -1), pictures, valid)
 
 
-def _mean(values: Tensor, counted: Tensor) -> Tensor:
+def mean_of_counted(values: Tensor, counted: Tensor) -> Tensor:
+    """Return the mean of the values that count; 0 if none does."""
     weights = counted.to(values.dtype)
     return (values * weights).sum() / weights.sum().clamp_min(1)
 

@@ -104,34 +104,23 @@ def sample_particles(
 def particles_over_time(
     scene: Scene,
     trajectory: Trajectory,
-    spacing: float | None = None,
     frames: Sequence[int] | None = None,
-    limit: int | None = LIMIT,
 ) -> Particles:
     """Return the particles of all bodies at their poses, followed by the vertices of all cloths.
 
-    Scenery is left out, as it does not collide.
-
-    Parameters
-    ----------
-    scene, trajectory
-        Bodies, and their motion.
-    spacing : float, optional
-        Metres; by default as in the original study (`default_spacing`).
-    frames : sequence of int, optional
-        Frames to return; by default all. `BadInputError` for frames outside the trajectory.
-    limit : int or None
-        See `sample_particles`.
+    They are as far apart as in the original study (`default_spacing`). Scenery is left out, as it
+    does not collide. ``frames``: those to return, by default all; `BadInputError` for frames
+    outside the trajectory.
     """
     wanted = np.arange(len(trajectory)) if frames is None else np.asarray(frames, np.int64)
     if wanted.size and not (wanted.min() >= 0 and wanted.max() < len(trajectory)):
         raise BadInputError(f"frames {wanted.tolist()} are not within 0..{len(trajectory) - 1}")
+    spacing = default_spacing(scene)
     clouds, things = [], []
     for index, body in enumerate(scene.bodies):
         if body.scenery:
             continue
-        step = default_spacing(scene) if spacing is None else spacing
-        points = sample_particles(body.shape, body.scale, step, limit).astype(np.float64)
+        points = sample_particles(body.shape, body.scale, spacing).astype(np.float64)
         rotations = trajectory.rotations[wanted, index].astype(np.float64)
         rotated = rotate_vectors(rotations[:, None], points[None])
         clouds.append(rotated + trajectory.positions[wanted, index, None])

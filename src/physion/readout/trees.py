@@ -81,9 +81,7 @@ class Forest:
         return roots, right
 
 
-def fit_forest(
-    features: NDArray[Any], labels: Booleans, *, trees: int = TREES, leaf: int = LEAF, seed: int = 0
-) -> Forest:
+def fit_forest(features: NDArray[Any], labels: Booleans, *, trees: int = TREES) -> Forest:
     """Return trees fitted on features (n, d) and outcomes (n,).
 
     Features and thresholds are rounded to float16, so that stored trees answer as fitted ones.
@@ -92,7 +90,7 @@ def fit_forest(
     from sklearn.ensemble import ExtraTreesClassifier
 
     forest = ExtraTreesClassifier(
-        trees, min_samples_leaf=leaf, max_features=FRACTION, random_state=seed, n_jobs=1
+        trees, min_samples_leaf=LEAF, max_features=FRACTION, random_state=0, n_jobs=1
     )
     forest.fit(_rounded(features), labels)
     chosen, values = [], []

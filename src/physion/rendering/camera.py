@@ -104,12 +104,6 @@ class View:
         with np.errstate(divide="ignore", invalid="ignore"):
             return homogeneous[..., :2] / depth[..., None], depth
 
-    def unproject(self, pixels: ArrayLike, depth: ArrayLike) -> F64:
-        """Return world points (..., 3) at pixel coordinates (..., 2) and planar depths (...)."""
-        xy = np.asarray(pixels, np.float64)
-        rays = apply(self.ray_matrix, np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1))
-        return np.asarray(np.asarray(self.camera.position) + rays * np.asarray(depth)[..., None])
-
     @property
     def ray_matrix(self) -> F64:
         """Matrix (3, 3) from a pixel (x, y, 1) to the world vector from the camera to depth 1."""

@@ -465,10 +465,7 @@ def compare(
     >>> float(result.scores.query("scenario == 'mean' and kind == 'model'")["accuracy"].iloc[0])
     1.0
     """
-    try:
-        draws = Bootstrap(resamples, seed=seed)
-    except ValueError as error:
-        raise BadInputError(f"resamples {resamples}: {error}") from error
+    draws = Bootstrap(resamples, seed=seed)
     rows, grouped, missing = _rows(predictions, groups)
     files = [Path(responses)] if isinstance(responses, str | Path) else [*map(Path, responses)]
     if rows is None and not files:

@@ -140,9 +140,9 @@ Rows = Sequence[Sequence[str]]
 """Rows of cells; a cell is text, or what a macro made."""
 
 
-def details(title: str, content: str, opened: bool = False) -> Markup:
-    """Return a part that opens on a click, or that is open at first; nothing without content."""
-    return Markup(MACROS.details(title, content, opened)) if content else Markup()
+def details(title: str, content: str) -> Markup:
+    """Return a part that opens on a click; nothing without content."""
+    return Markup(MACROS.details(title, content)) if content else Markup()
 
 
 def heading(text: str) -> Markup:

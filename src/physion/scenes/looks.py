@@ -122,16 +122,11 @@ def is_mistakable(color: Vec3, role: Vec3) -> bool:
     return colors_are_similar(color, role, ROLE_MARGIN) or (same_hue and strong)
 
 
-def random_color(
-    rng: np.random.Generator, avoid: Sequence[Vec3] = (), margin: float = MARGIN
-) -> Vec3:
-    """Draw a uniform random colour that is not too similar to any of ``avoid``.
-
-    ``margin`` must leave some colours allowed: 0.5 at most if there are colours to avoid.
-    """
+def random_color(rng: np.random.Generator, avoid: Sequence[Vec3] = ()) -> Vec3:
+    """Draw a uniform random colour that is not too similar to any of ``avoid``."""
     while True:
         red, green, blue = (float(channel) for channel in rng.random(3))
-        if not any(colors_are_similar((red, green, blue), other, margin) for other in avoid):
+        if not any(colors_are_similar((red, green, blue), other, MARGIN) for other in avoid):
             return red, green, blue
 
 

@@ -280,7 +280,7 @@ def test_with_participants_baselines_stand_next_to_models() -> None:
     stimuli = test.drop_duplicates("stimulus")["stimulus"]
     p = np.random.default_rng(0).random(len(stimuli))
     given = pd.DataFrame({"model": "m", "stimulus": stimuli, "p_contact": p, "predicted": p > 0.5})
-    found = compare_everywhere(given, test, QUICK, halves=10)
+    found = compare_everywhere(given, test, QUICK)
     scores = found.scores.set_index(["scenario", "model", "measure"])
     assert list(found.scores["model"].unique()) == ["m", *COMPUTED]
     kinds = found.scores.drop_duplicates("model").set_index("model")["kind"]

@@ -311,7 +311,7 @@ def everywhere(**changes: object) -> tuple[PeopleComparison, pd.DataFrame, pd.Da
         for model, p in (("people", shares["yes"]), ("chance", generator.random(len(shares))))
     ]  # fmt: skip
     predictions = pd.concat(parts, ignore_index=True).assign(**changes)
-    return compare_everywhere(predictions, test, FEW, halves=20), predictions, test
+    return compare_everywhere(predictions, test, FEW), predictions, test
 
 
 def test_all_scenarios_and_their_mean() -> None:
@@ -411,7 +411,7 @@ def test_what_is_missing_somewhere_is_counted_and_undefined_there() -> None:
     constant = predictions["stimulus"].str.startswith("roll")
     odd = predictions.assign(p_contact=predictions["p_contact"].where(~constant, 0.5))
     odd.loc[0, "stimulus"] = "elsewhere"
-    found = compare_everywhere(odd, test, FEW, halves=20)
+    found = compare_everywhere(odd, test, FEW)
     scores = found.scores.set_index(["model", "scenario", "measure"])
     row = scores.loc[("chance", "mean", "r")]
     assert np.isnan(row["value"]) and row["reason"].startswith("undefined in roll")
@@ -419,7 +419,7 @@ def test_what_is_missing_somewhere_is_counted_and_undefined_there() -> None:
         ["people", "unknown", "people did not see it", 1],
         ["people", "collide", "the model does not predict it", 1],
     ]
-    no_roll = compare_everywhere(predictions[~constant], test, FEW, halves=20)
+    no_roll = compare_everywhere(predictions[~constant], test, FEW)
     gone = no_roll.dropped.set_index(["model", "scenario"])["stimuli"]
     assert gone.to_dict() == {("people", "roll"): 20, ("chance", "roll"): 20}
 
@@ -431,7 +431,7 @@ def test_thirds_are_parted_at_their_edges() -> None:
 
 
 def test_r_within_thirds_matches_their_stimuli(answers: ScenarioAnswers, models: Models) -> None:
-    table = r_by_third(models.p_contact, answers.yes, answers.label, halves=30)
+    table = r_by_third(models.p_contact, answers.yes, answers.label)
     shares = answers.p_yes()
     third = difficulty_third(np.where(answers.label == 1, shares, 1 - shares)).to_numpy()
     for row in table[table["model"] >= 0].itertuples():

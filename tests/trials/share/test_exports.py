@@ -29,7 +29,7 @@ from physion.trials.share.card import about_states
 from physion.trials.share.gltf import export_gltf, motion_gltf, trial_gltf
 from physion.trials.share.lance import export_lance
 from physion.trials.share.lerobot import CAMERA, export_lerobot, states_of
-from physion.trials.share.result_tables import OFFICIAL_COLUMNS, export_result_tables
+from physion.trials.share.result_tables import _OURS, export_result_tables
 from physion.trials.trial_file import Trial
 from support.programs import find_program
 from support.viewer_dataset import FRAMES, PLANS, make_dataset, make_scene, make_trajectory
@@ -429,7 +429,7 @@ def test_the_notebooks_find_every_scenario(tmp_path: Path) -> None:
         assert row["correct"] == (number % 2 == 0)
         assert (row["Readout Type"], row["Model"], row["Train Accuracy"]) == ("A", "m", 0.5)
         assert row["Predicted Prob_false"] + row["Predicted Prob_true"] == 1
-    assert list(frame) == list(OFFICIAL_COLUMNS)
+    assert list(frame) == list(_OURS)
     assert "0.6666666666666666" in made.read_text()  # digits stay
 
 

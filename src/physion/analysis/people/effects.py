@@ -262,10 +262,11 @@ def difficulty_third(accuracy: npt.ArrayLike) -> pd.Series:
     return pd.Series(names, dtype=object).where(np.isfinite(values), np.nan)
 
 
-def r_by_third(
-    p_contact: npt.ArrayLike, yes: npt.ArrayLike, label: npt.ArrayLike, halves: int = 200,
-    seed: int = 0,
-) -> pd.DataFrame:  # fmt: skip
+HALVES_OF_THIRDS = 200
+"""Number of random splits of the people in `r_by_third`."""
+
+
+def r_by_third(p_contact: npt.ArrayLike, yes: npt.ArrayLike, label: npt.ArrayLike) -> pd.DataFrame:
     """Return r of models with the average person within hard, chance and easy stimuli of one
     scenario.
 
@@ -277,8 +278,6 @@ def r_by_third(
         (n, s): answers of people.
     label
         (s,): official outcomes.
-    halves, seed
-        Number of random splits of the people, and their seed.
 
     Returns
     -------
@@ -302,7 +301,7 @@ def r_by_third(
             models[:, members], np.broadcast_to(p_yes[members], (len(models), len(members)))
         )
         rows += [(name, len(members), k, float(value), np.nan, np.nan) for k, value in enumerate(r)]
-        among = split_halves(answers[:, members], halves, seed) if len(members) else np.empty(0)
+        among = split_halves(answers[:, members], HALVES_OF_THIRDS) if len(members) else np.empty(0)
         found = distribution(among)
         rows.append((name, len(members), -1, found["mean"], found["low"], found["high"]))
     return pd.DataFrame(rows, columns=["third", "stimuli", "model", "r", "low", "high"])

@@ -19,8 +19,7 @@ from urllib.parse import parse_qsl, urlsplit
 from starlette.requests import Request
 from starlette.responses import Response
 
-from physion.core.files import digest_of
-from physion.experiment.study.identity import Secrets, check_password
+from physion.experiment.study.identity import Secrets, check_password, hash_token
 
 PATH = "/experimenter"
 COOKIE = "physion_experimenter"
@@ -104,7 +103,7 @@ class Access:
         """Log the browser in and set its cookie, of whose token only the hash is kept."""
         self._logins.pop(_hashed(request), None)
         token, now = secrets.token_urlsafe(32), self._clock()
-        self._logins[_hash(token)] = _Login(now, now)
+        self._logins[hash_token(token)] = _Login(now, now)
         if len(self._logins) > MAX_LOGINS:
             self._logins.popitem(last=False)
         response.set_cookie(
@@ -129,11 +128,7 @@ class Access:
 
 def _hashed(request: Request) -> str:
     """Return the hash of the token in the browser's cookie."""
-    return _hash(request.cookies.get(COOKIE, ""))
-
-
-def _hash(token: str) -> str:
-    return digest_of(token.encode("utf-8", "replace"))
+    return hash_token(request.cookies.get(COOKIE, ""))
 
 
 async def read_form(request: Request) -> dict[str, str] | None:

@@ -232,14 +232,13 @@ def _run_exclusively(folder: Path, work: Callable[[Connection], int]) -> int:
     return count
 
 
-async def forget_raw_ids(store: Store, participants: Sequence[str] | None = None) -> int:
-    """Delete raw ids as `forget` does, while the study is served.
+async def forget_raw_ids(store: Store) -> int:
+    """Delete all raw ids as `forget` does, while the study is served.
 
     The file is not vacuumed, which would delay answers: SQLite overwrites deleted rows by itself
     (``secure_delete``). Participants who enter again leave their ids again.
     """
-    _check_participants(participants)
-    count = await store.write(lambda connection: _delete_raw_ids(connection, participants))
+    count = await store.write(lambda connection: _delete_raw_ids(connection, None))
     await asyncio.to_thread(_erase_deleted_bytes, store.engine, compact=False)
     return count
 

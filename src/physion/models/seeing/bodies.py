@@ -93,19 +93,12 @@ ANGLES = (math.pi / 6, math.pi / 3, math.pi / 2)
 """Angles by which it may have turned."""
 
 
-def find(rays: Rays, prior: Prior, solids: Sequence[Solid] | None = None) -> Placed:
+def find(rays: Rays, prior: Prior) -> Placed:
     """Return the shape of the library, with scale and pose, that fits rays best.
 
-    Parameters
-    ----------
-    rays
-        Of an object that is seen.
-    prior
-        What is expected of its pose.
-    solids
-        Shapes to choose from, simple ones first; by default all.
+    ``rays``: of an object that is seen. ``prior``: what is expected of its pose.
     """
-    choice = library() if solids is None else solids
+    choice = library()
     few, some = rays.first(FEW), rays.first(SOME)
     low, high = _box(np.eye(3), rays)
     flat = bool(high[2] - low[2] < FLAT * (high - low).max() and low[2] < prior.floor + NEAR_FLOOR)

@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from physion.compute.local import available_cores
 from physion.core.errors import BadInputError
 from physion.core.version import version_digest
 from physion.numerics.linear_algebra import unit
@@ -245,6 +246,4 @@ def _default_threads() -> int:
     given = os.environ.get("OMP_NUM_THREADS", "")
     if given.isdigit() and int(given) > 0:
         return int(given)
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return available_cores()

@@ -37,7 +37,7 @@ class Theme:
     palette: tuple[str, ...]
 
     def mark(self, index: int) -> tuple[str, str]:
-        """Return colour and marker of the ``place``-th of things to distinguish."""
+        """Return colour and marker of the ``index``-th of things to distinguish."""
         return self.palette[index % len(self.palette)], MARKERS[index % len(MARKERS)]
 
 

@@ -31,7 +31,7 @@ from physion.scenes.sampling.build import scenarios
 from physion.scenes.sampling.parameters import check_params, check_together, read_params
 from physion.scenes.scene import Scene
 
-DEFAULT, FAMILIARIZATION, DEBUG = "default", "familiarization", "debug"
+DEFAULT, FAMILIARIZATION = "default", "familiarization"
 """Names of presets that every scenario of this package has besides the published ones."""
 
 

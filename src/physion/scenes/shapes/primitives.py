@@ -155,7 +155,6 @@ class ModelBounds:
 
     bottom: Vec3
     size: Vec3
-    category: str = ""
 
 
 def prop_for(category: str, model: str = "") -> str:
@@ -194,8 +193,7 @@ def _read_bounds(record: object, where: str) -> ModelBounds:
                 for side in ("left", "right", "front", "back", "top", "bottom")
             ]
         )
-        category = str(record.get("category", ""))  # type: ignore[attr-defined]
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise BadInputError(f"{where} lacks {error} in its bounds") from error
     if not np.isfinite(corners).all():
         raise BadInputError(f"{where}: its bounds are not finite")
@@ -204,8 +202,7 @@ def _read_bounds(record: object, where: str) -> ModelBounds:
     x, y = (low + high)[:2] / 2
     return ModelBounds(
         (float(x), float(y), float(low[2])),
-        (float(size[0]), float(size[1]), float(size[2])),
-        category,
+        vec3(size),
     )
 
 

@@ -32,12 +32,10 @@ class PropShape(Shape):
     """Shape whose triangles may have looks of their own.
 
     - ``paint`` (F,): per triangle 0 for the look of the body, or i for ``own_looks[i - 1]``.
-    - ``modelled_size``: size in metres at which the prop was modelled.
     """
 
     paint: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
     own_looks: tuple[Look, ...] = ()
-    modelled_size: Vec3 = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +99,6 @@ def _fit_to_unit_box(name: str, parts: list[PropPart]) -> PropShape:
     looks = [look for part in parts for look in (part.look, *(p[1] for p in part.patches))]
     own_looks = tuple(dict.fromkeys(look for look in looks if look is not None))
     paint = np.concatenate([_paint(part, own_looks) for part in parts])
-    x, y, z = (float(side) for side in high - low)
     return PropShape(
         PREFIX + name,
         whole.moved(scale, offset),
@@ -109,7 +106,6 @@ def _fit_to_unit_box(name: str, parts: list[PropPart]) -> PropShape:
         hollow=len(pieces) > 1,
         paint=paint,
         own_looks=own_looks,
-        modelled_size=(x, y, z),
     )
 
 
@@ -135,17 +131,11 @@ def board(center: ArrayLike, half: ArrayLike, look: Look | None = None) -> PropP
     return solid(box(center, half), look)
 
 
-def block(
-    low: Sequence[float],
-    high: Sequence[float],
-    bottom: float,
-    top: float,
-    look: Look | None = None,
-) -> PropPart:
+def block(low: Sequence[float], high: Sequence[float], bottom: float, top: float) -> PropPart:
     """Return a tapered box: half sizes ``low`` at height ``bottom``, ``high`` at ``top``."""
     signs = [(x, y) for x in (-1, 1) for y in (-1, 1)]
     points = [(x * low[0], y * low[1], bottom) for x, y in signs]
-    return solid(hull(points + [(x * high[0], y * high[1], top) for x, y in signs]), look)
+    return solid(hull(points + [(x * high[0], y * high[1], top) for x, y in signs]))
 
 
 def cushion(
@@ -313,9 +303,9 @@ def arc(
     return np.asarray(middle + cos(angles) * x + sin(angles) * y)
 
 
-def ring(x: float, y: float, z: float, sides: int = 12) -> list[Vec3]:
-    """Return the corners of a horizontal ellipse at height ``z``."""
-    angles = 2 * math.pi * np.arange(sides) / sides
+def ring(x: float, y: float, z: float) -> list[Vec3]:
+    """Return the 12 corners of a horizontal ellipse at height ``z``."""
+    angles = 2 * math.pi * np.arange(12) / 12
     return [(x * cos(t), y * sin(t), z) for t in angles]
 
 

@@ -315,10 +315,10 @@ def put_bytes(group: Any, name: str, data: bytes) -> None:
     made.write(h5s.ALL, h5s.ALL, array)
 
 
-def put_picture(group: Any, name: str, picture: NDArray[Any], *, shuffle: bool = False) -> None:
+def put_picture(group: Any, name: str, picture: NDArray[Any]) -> None:
     """Write a picture as one compressed chunk."""
     array = np.ascontiguousarray(picture)
-    layout = _compressed(array.shape, shuffle)
+    layout = _compressed(array.shape, shuffle=False)
     made = h5d.create(group, name.encode(), _type(array.dtype), _space(array.shape), layout)
     made.write(h5s.ALL, h5s.ALL, array)
 

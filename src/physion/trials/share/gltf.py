@@ -56,8 +56,8 @@ _TO_Y_UP = [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
 """Quaternion (x, y, z, w) of the quarter turn that takes z to y."""
 
 
-def trial_gltf(trial: Trial, *, look: str | None = None) -> bytes:
-    """Return a trial as a GLB file; ``look``: colours, by default as in its movie."""
+def trial_gltf(trial: Trial) -> bytes:
+    """Return a trial as a GLB file, in the colours of its movie."""
     meta, labels = trial.metadata, trial.labels
     facts = {
         "trial": meta.trial,
@@ -67,7 +67,7 @@ def trial_gltf(trial: Trial, *, look: str | None = None) -> bytes:
         **({"contact": labels.contact, "first_contact": labels.first_frame} if labels else {}),
     }
     return motion_gltf(
-        trial.shown(look),
+        trial.shown(),
         trial.trajectory,
         frame_time=meta.frame_time,
         aspect=meta.width / meta.height,

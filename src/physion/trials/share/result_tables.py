@@ -41,8 +41,6 @@ _OURS = {
     "Dynamics Training Seed": "seed",
 }
 """Our column by the official one, in the official order; None for what is computed, "" for none."""
-OFFICIAL_COLUMNS = tuple(_OURS)
-"""Official columns in their order."""
 NEEDED = frozenset({"model", "stimulus", "scenario", "p_contact", "outcome", "readout"})
 """Columns by which a CSV file is recognised as a table of predictions."""
 NO_DATASET = "none"
