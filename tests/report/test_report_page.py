@@ -18,7 +18,8 @@ from physion.analysis.comparison import Comparison, compare_scores
 from physion.analysis.figure_tables import SCENARIO_ZONE
 from physion.analysis.intervals import Bootstrap
 from physion.analysis.metrics import score_metrics
-from physion.analysis.published.claims import published_results
+from physion.analysis.published.claims import results_of
+from physion.analysis.published.tables import read_published
 from physion.analysis.scores import COMPUTED, MAJORITY, OUTCOME, TWO_PEOPLE
 from physion.analysis.tables import MEAN, POOLED
 from physion.core.errors import BadInputError
@@ -369,7 +370,7 @@ PUBLISHED = [*(f"panel_{name}" for name in "acde"), "figure_s1", "figure_s3"]
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_the_page_of_the_published_results(official: Path, tmp_path: Path) -> None:
-    built = build_published_report(published_results(official), tmp_path / "published")
+    built = build_published_report(results_of(read_published(official)), tmp_path / "published")
     whole = re.sub(r"<(style|figure)>.*?</\1>", " ", built.read_text(encoding="utf-8"), flags=re.S)
     text = " ".join(unescape(re.sub(r"<[^>]+>", " ", whole)).split())
     table = pd.read_csv(built.parent / "tables" / "accuracies.csv")

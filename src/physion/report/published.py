@@ -16,8 +16,8 @@ from physion.analysis.figure_tables import (
     PARTICIPANTS,
     SCENARIO_ZONE,
 )
-from physion.analysis.published.claims import TITLES, PublishedResults, published_results
-from physion.analysis.published.tables import grid
+from physion.analysis.published.claims import TITLES, PublishedResults, results_of
+from physion.analysis.published.tables import grid, read_published
 from physion.analysis.tables import MEAN, records
 from physion.core.files import write_atomic
 from physion.core.html import Markup, joined
@@ -50,7 +50,7 @@ TITLE = "The published results of the original study, recomputed from its releas
 def recompute_published(humans: Path | str = PACKAGED) -> PublishedResults:
     """Recompute the published numbers from the released tables: the package's, or of a folder."""
     data = find_official(humans)
-    return published_results(Path(humans) if data is None else data.results.parent)
+    return results_of(read_published(Path(humans) if data is None else data.results.parent))
 
 
 def build_published_report(results: PublishedResults, folder: Path) -> Path:

@@ -14,14 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 from scipy import stats
 
-from physion.analysis.intervals import LEVEL, Bootstrap
+from physion.analysis.intervals import LEVEL
 from physion.analysis.mixed import fit_linear
 from physion.analysis.published.tables import (
     END_TO_END,
@@ -41,7 +40,6 @@ from physion.analysis.published.tables import (
     panel_e,
     people_by_scenario,
     people_claims,
-    read_published,
 )
 from physion.core.errors import BadInputError
 
@@ -470,29 +468,20 @@ class PublishedResults:
     descriptions: Mapping[str, str]
 
 
-def published_results(folder: Path, bootstrap: Bootstrap | None = None) -> PublishedResults:
-    """Recompute all results from the official data in ``folder`` (``results/`` and ``humans/``).
-
-    Raises `BadInputError` for missing or invalid files.
-    """
-    return results_of(read_published(folder), bootstrap)
-
-
-def results_of(released: PublishedTables, bootstrap: Bootstrap | None = None) -> PublishedResults:
-    """Recompute all results from tables that are already read."""
-    draws = bootstrap or Bootstrap()
+def results_of(released: PublishedTables) -> PublishedResults:
+    """Recompute all results from the released tables."""
     tables = {
-        "accuracies": accuracy_table(released, draws),
-        "panel_a": panel_a(released, draws),
-        "panel_c": panel_c(released, draws),
-        "panel_d": panel_d(released, draws),
-        "panel_e": panel_e(released, draws),
-        "accuracy_kappa": accuracy_and_kappa(released, draws),
+        "accuracies": accuracy_table(released),
+        "panel_a": panel_a(released),
+        "panel_c": panel_c(released),
+        "panel_d": panel_d(released),
+        "panel_e": panel_e(released),
+        "accuracy_kappa": accuracy_and_kappa(released),
         "figure_s1": figure_s1(released),
-        "figure_s3": figure_s3(released, draws),
+        "figure_s3": figure_s3(released),
         "not_made": pd.DataFrame(list(NOT_MADE.items()), columns=["figure", "reason"]),
         "regressions": published_regressions(released),
-        "people": people_by_scenario(released, draws),
+        "people": people_by_scenario(released),
         "people_claims": people_claims(released),
         "left_out": released.dropped,
     }
