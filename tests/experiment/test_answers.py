@@ -269,10 +269,9 @@ class Load:
     async def _run_waves(self, number: int) -> None:
         wave = 0
         while not self._stopping.is_set():
-            # Retry often, but leave processor time for the server.
             plan = SimulationPlan(
-                self._url, self._people, seed=1000 * number + wave, dropouts=0.0, pace=0.01,
-                waits_s=(0.05, 0.4), patience_s=300.0, media=False,
+                self._url, self._people, seed=1000 * number + wave, dropouts=0.0,
+                waits_s=(0.05, 0.4), patience_s=300.0,
             )  # fmt: skip
             self.waves.append(await simulate(self._study, self._secrets, plan))
             wave += 1

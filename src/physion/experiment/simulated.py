@@ -274,12 +274,8 @@ class SimulationPlan:
         Seed of all random draws.
     scenario
         The scenario of everybody; all scenarios in rotation if None.
-    pace
-        Further seconds before each answer.
     dropouts
         Fraction of people who close the page before a random test trial.
-    media
-        Also fetch movies and maps.
     waits_s
         First and longest pause between retries of a request in seconds.
     patience_s
@@ -289,12 +285,10 @@ class SimulationPlan:
     url: str
     participants: int = 20
     scenario: str | None = None
-    pace: float = 0.0
     seed: int = 0
     dropouts: float = 0.1
     waits_s: tuple[float, float] = (0.1, 2.0)
     patience_s: float = 60.0
-    media: bool = True
 
 
 class Participation:
@@ -413,7 +407,6 @@ class Participation:
             await self._browser.ask("POST", "/api/showings", showing)
             await self._live(media.fixation_ms + cue_ms)
             await self._live(1000 * media.frames / media.rate + body.rt_ms)
-            await asyncio.sleep(self._plan.pace)
             answer = await self._browser.ask("POST", "/api/answers", body)
         except RefusedError as refused:
             return state_after(refused)
@@ -445,8 +438,8 @@ class Participation:
         )
 
     async def _fetch(self, *paths: str) -> None:
-        """Fetch media, unless the plan leaves them out."""
-        for path in paths if self._plan.media else ():
+        """Fetch media."""
+        for path in paths:
             if not await self._browser.ask("GET", path):
                 raise PhysionError(f"{path}: the server sent an empty file")
 
