@@ -268,7 +268,7 @@ def _floats(values: list[float]) -> Any:
 
 # Writing of many small arrays into an HDF5 file.
 #
-# A frame of an official file has about 30 arrays of some 100 bytes. `h5py.Group.create_dataset`
+# A frame of an official file has about 30 arrays of some 100 bytes. ``h5py.Group.create_dataset``
 # takes three times as long for each as HDF5 itself, so they are created with h5py's lower layer
 # here.
 
