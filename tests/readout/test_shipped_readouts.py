@@ -223,7 +223,9 @@ def test_own_trials_are_fitted_where_there_are_as_many(
     assert not unlike_shipped(index, replace(spec, image_size=128), rendered=True)
 
 
-def test_trials_unlike_those_of_a_pretrained_model_are_refused_or_said(tmp_path: Path) -> None:
+def test_looks_and_movies_that_a_pretrained_model_never_saw_are_refused_or_named(
+    tmp_path: Path,
+) -> None:
     make_dots(tmp_path / "dots", {"testing": 2}, ("drop",))
     index = Dataset(tmp_path / "dots").index
     pixels = partial(evaluate, "intuition-pixels", tmp_path / "dots", tmp_path / "out")

@@ -7,7 +7,8 @@ from the mask that a network finds in pictures (`intuition-pixels`, `physion.mod
 
     x_k = f(track_k, place_k - place_agent, place_k - place_patient, d track_k, constants_k),
 
-where places are a part of the track (`VIEWS`), and L blocks of attention over the objects, in no order, lead to the answer
+where places are a part of the track (`VIEWS`). L blocks of attention over the objects, in no order,
+lead to the answer
 
     P(contact) = sigmoid( g(x_agent, x_patient, mean_k x_k) ).
 

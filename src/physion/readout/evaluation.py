@@ -397,7 +397,7 @@ class _Evaluate:
     def _warnings(
         self, model: Model, splits: Sequence[ScenarioSplit], readouts: Sequence[Readout]
     ) -> tuple[str, ...]:
-        """Return what to say of trials that differ from those of the weights or readouts that ship.
+        """Return how the tested trials differ from what weights or readouts that ship have seen.
 
         Of readouts only if some would be used for ``readouts``.
         """
