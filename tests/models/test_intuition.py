@@ -276,7 +276,7 @@ def test_a_scene_without_a_probe_leaves_its_token_empty_and_the_note_says_so() -
     model: Any = build_model("intuition-states", objects=4, weights="random")
     made = scene(*(Body(f"b{n}", "cube", (0.0, float(n), 0.0), (1.0, 1.0, 1.0)) for n in (1, 2)))
     frames = np.array([model.spec.context_frames()])
-    shown = Batch(("s",), frames, np.ones_like(frames, np.bool_), state=(motion(made),))
+    shown = Batch(("s",), frames, np.ones_like(frames, np.bool_), state=(motion(made),)).to("cpu")
     tokens = state_tokens(motion(made), "s", frames[0], 4)
     assert int((tokens[..., 0] > 0).any(0).sum()) == 3
     assert model.notes(shown) == ["5 objects, only 3 are looked at"]
