@@ -383,14 +383,16 @@ def section(learner: Learner) -> tuple[str, str]:
         + " The training began from weights that may have seen these own trials, also those that "
         "are held out." * bool(options.start),
         "",
-        f"| model | trials per rigid scenario | own, rigid | official, rigid | {' | '.join(scenarios)} |",
+        "| model | trials per rigid scenario | own, rigid | official, rigid "
+        f"| {' | '.join(scenarios)} |",
         "|---|---|---|---" + "|---" * len(scenarios) + "|",
         *rows,
     ]
     if options.counts:
         rise = slope([*options.counts, most], [*rigid, learner.rigid(answers)])
         lines += ["", f"Each doubling of the trials adds, rigid: {rise:+.3f}."]
-    return name if not groups and not rigid else f"{most} trials per rigid scenario", "\n".join(lines)
+    title = f"{most} trials per rigid scenario" if groups or rigid else name
+    return title, "\n".join(lines)
 
 
 if __name__ == "__main__":
