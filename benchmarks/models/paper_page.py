@@ -404,12 +404,13 @@ def page_text(
         "",
         "## What does not come out the same",
         "Claims whose test is significant (p < .05) in the released tables and here, with another "
-        "sign, or in one of the two only. *Neither*: in none of the two, whatever the signs. *Not "
-        "shown here* is no refutation: the models are small, and fewer. Rows of one model and "
-        "scenario share their stimuli, which these tests do not know, so that their p are too "
-        "small, there and here. Encoders of ImageNet are frozen: under *observed* and *full* their "
-        "rows are the same with mlp and lstm and under all protocols, which makes differences of "
-        "protocols smaller. Claims about people only are those of `physion compare --published`.",
+        "sign, or in one of the two only. *Neither*: in none of the two, whatever the signs, which "
+        "is what a claim of no difference says. *Not shown here* is no refutation: the models are "
+        "small, and fewer. Rows of one model and scenario share their stimuli, which these tests "
+        "do not know, so that their p are too small, there and here. Encoders of ImageNet are "
+        "frozen: under *observed* and *full* their rows are the same with mlp and lstm and under "
+        "all protocols, which makes differences of protocols smaller. Claims about people only are "
+        "those of `physion compare --published`.",
         "",
         *(differ or ["Nothing of what was computed."]),
         "",
