@@ -230,12 +230,12 @@ def test_looks_and_movies_that_a_pretrained_model_never_saw_are_refused_or_named
     index = Dataset(tmp_path / "dots").index
     pixels = partial(evaluate, "intuition-pixels", tmp_path / "dots", tmp_path / "out")
     write_index(tmp_path / "dots", index.assign(look="free"))
-    with pytest.raises(BadInputError, match=r"in the look redyellow, .* free; .* cue=true"):
+    with pytest.raises(BadInputError, match=r"the look redyellow, .* is free; .* cue=true"):
         pixels()
     assert pixels(options={"cue": True}, dry_run=True).evaluated
     write_index(tmp_path / "dots", index.assign(look="redyellow"))
     (words,) = pixels().warnings
-    assert "predictions may be wrong: stored movies of 64 x 64 pixels, and the model sees" in words
+    assert "stored movies of 64 x 64 pixels, and the model sees 96 (" in words
     oblong, _ = unlike_shipped(
         index.assign(width=128), build_model("intuition-pixels").spec, rendered=False
     )

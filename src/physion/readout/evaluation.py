@@ -288,11 +288,11 @@ class _Evaluate:
             provenance = dataclasses.replace(provenance, inputs=", ".join(model.spec.inputs))
         looks = self._looks()
         if (look := ask(model, "look")) and looks != {look}:
+            cue = ", or --option cue=true, which takes them from true masks of the first frame"
             raise BadInputError(
-                f"{provenance.model} looks for agent and patient in the look {look}, and the "
-                f"tested trials have {' and '.join(sorted(looks))}; make trials with --look {look}"
-                + ", or add --option cue=true"
-                * hasattr(model.settings, "cue")
+                f"{provenance.model} finds agent and patient by the colours of the look {look}, "
+                f"but the look of the tested trials is {' and '.join(sorted(looks))}; use trials "
+                f"made with --look {look}{cue if hasattr(model.settings, 'cue') else ''}"
             )
         shipped = None if rules.together else self._shipped(model)
         path = self._table(cell, model, training, provenance, ways, shipped, rules)
@@ -404,7 +404,11 @@ class _Evaluate:
         name, rendered = model.provenance().model, self.settings.rendered
         unlike = unlike_shipped(self.dataset.index, model.spec, rendered=rendered)
         if ask(model, "look"):
-            return tuple(f"{name}: predictions may be wrong: {words}" for words in unlike)
+            return tuple(
+                f"{name}: predictions may be wrong, since trials differ from those of the training: "
+                f"{words}"
+                for words in unlike
+            )
         offered = self._offered(model)
         if offered is None:
             return ()
