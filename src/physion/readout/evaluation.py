@@ -405,8 +405,7 @@ class _Evaluate:
         unlike = unlike_shipped(self.dataset.index, model.spec, rendered=rendered)
         if ask(model, "look"):
             return tuple(
-                f"{name}: predictions may be wrong, since trials differ from those of the training: "
-                f"{words}"
+                f"{name}: predictions may be wrong, since it was trained on other trials: {words}"
                 for words in unlike
             )
         offered = self._offered(model)
