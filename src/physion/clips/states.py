@@ -133,13 +133,13 @@ class TrialMotions(Mapping[str, Motion]):
             return
         self._kept[trial] = motion
         self._bytes += _size(motion)
-        while self._bytes > _kept_bytes() and len(self._kept) > 1:
+        while self._bytes > kept_bytes() and len(self._kept) > 1:
             self._bytes -= _size(self._kept.popitem(last=False)[1])
 
 
 @cache
-def _kept_bytes() -> int:
-    """Return how many bytes of motions are kept in memory."""
+def kept_bytes() -> int:
+    """Return how many bytes of motions are kept in memory, and as many of particles."""
     names = ("SC_PAGE_SIZE", "SC_PHYS_PAGES")
     if not all(name in getattr(os, "sysconf_names", {}) for name in names):
         return _LEAST_BYTES

@@ -114,6 +114,20 @@ def test_kinds_scenery_and_absent_bodies() -> None:
         scene_particles(scene, Sampling(), (False,) * 4)
 
 
+def test_a_scene_that_is_read_again_still_has_its_particles_and_another_of_its_name_others() -> (
+    None
+):
+    scene = scene_of(body("a"), body("b"), body("c"))
+    again = dataclasses.replace(scene)
+    assert again is not scene and scene_particles(again, Sampling()) is scene_particles(
+        scene, Sampling()
+    )
+    other = dataclasses.replace(scene, roles=Roles("b", "c"))
+    found = scene_particles(other, Sampling())
+    assert (found.agent, found.patient) == (1, 2)
+    assert scene_particles(scene, Sampling()).agent != 1
+
+
 def test_particles_move_with_their_bodies() -> None:
     scene, trajectory = tumbling()
     sampling = Sampling(0.1, 500, 500, cloth_step=1)

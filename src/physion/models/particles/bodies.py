@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from physion.clips.batch import Motion
+from physion.clips.states import kept_bytes
 from physion.core.errors import BadInputError
 from physion.numerics.linear_algebra import cross, norm
 from physion.numerics.rotations import rotation_matrices
@@ -233,11 +234,12 @@ class Poses:
     loose: F64
 
 
-_Key = tuple[int, Sampling, tuple[bool, ...]]
+_Key = tuple[str, Sampling, tuple[bool, ...]]
 _kept: OrderedDict[_Key, tuple[Scene, SceneParticles]] = OrderedDict()
-"""Particles of the scenes that were asked for last, and the scenes, so that their ids stay."""
-_BODIES_KEPT = 4_000_000
-"""Largest number of particles that are kept, about 0.5 GB."""
+"""Particles of the scenes that were asked for last, and the scenes. A training reads a scene anew
+where there are more motions than fit into memory; it still has its particles."""
+_BYTES = 125
+"""Of a particle that is kept, about."""
 _lock = threading.Lock()
 
 
@@ -261,16 +263,18 @@ def scene_particles(
         If no object is left, or there are more than `MAX_PARTICLES`.
     """
     there = tuple(present) if present is not None else (True,) * len(scene.names())
-    key = (id(scene), sampling, there)
+    key = (scene.name, sampling, there)
     with _lock:
         found = _kept.get(key)
-        if found is not None:
+        # Another scene can have this name.
+        if found is not None and (found[0] is scene or found[0] == scene):
             _kept.move_to_end(key)
             return found[1]
     particles = _sample(scene, sampling, there)
     with _lock:
         _kept[key] = scene, particles
-        while len(_kept) > 1 and sum(len(p.owners) for _, p in _kept.values()) > _BODIES_KEPT:
+        most = kept_bytes() // _BYTES
+        while len(_kept) > 1 and sum(len(p.owners) for _, p in _kept.values()) > most:
             _kept.popitem(last=False)
     return particles
 
