@@ -341,9 +341,10 @@ def ended_as_recorded(path: Path) -> pd.Series:
 
 @cache
 def kinds(scenario: str) -> Mapping[str, str]:
-    """Return the kind of every configuration: the first that differs in room and scenery only.
+    """Return the kind of every configuration, by name.
 
-    Names of configurations are those of presets, or official ones where there are some.
+    Configurations that differ in room and scenery only are one kind, which has the name of the
+    first of them. Names are official, or of presets that have no official name.
     """
     first: dict[str, str] = {}
     found = {}

@@ -1,7 +1,6 @@
 """Speed of the vision models, and what they have learned of movies that they were not trained on.
 
     OMP_NUM_THREADS=1 python benchmarks/models/vision_models.py speed --write  # seconds a clip
-    OMP_NUM_THREADS=1 python benchmarks/models/vision_models.py answers --write  # of intuition
     OMP_NUM_THREADS=1 python benchmarks/models/vision_models.py longest --write  # memory of *full*
     OMP_NUM_THREADS=1 python benchmarks/models/vision_models.py answers --write  # of intuition
     python benchmarks/models/vision_models.py learn FOLDER --write  # after trainings
@@ -12,9 +11,6 @@ imagined, on random pictures with moving boxes; of frozen encoders, which have r
 it times a training step of the dynamics on stored features. Times are processor time on a CPU, and
 elapsed time on a GPU (``--accelerator cuda``, also with ``--precision bf16-mixed``), where batches
 are 16 times as large.
-
-``answers`` times predictions of models of intuition from masks or pictures in memory, of moving
-boxes too.
 
 ``longest`` encodes random pictures, as many as *full* reads of the longest movies, 602 frames, each
 model in a process of its own, and prints the memory of that process before and at most.
@@ -63,6 +59,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from physion import Dataset, build_model
 from physion.clips.batch import Batch, Spec
@@ -92,12 +89,6 @@ DYNAMICS = tuple(name for name in METRICS if name not in SHIPPED)
 """Models of which the dynamics are trained alone."""
 ENCODERS = ("pVGG-mlp", "pDeIT-mlp", "pEffNetLite0-mlp")
 """Frozen encoders whose speed is measured, with a training step of the dynamics."""
-INTUITION = ("intuition-masks", "intuition-pixels")
-"""Models of which the speed of predictions is measured."""
-BOXES = 6
-"""Objects of a clip that is predicted."""
-ANSWERED = 50
-"""Clips that are predicted together."""
 INTUITION = ("intuition-masks", "intuition-pixels")
 """Models whose predictions are timed."""
 ANSWERED = 50
@@ -137,19 +128,24 @@ def random_clips(clips: int, frames: int, spec: Spec) -> Batch:
     part = np.linspace(0, 1, frames)[None, :, None, None]
     centers = ends[0] + part * (ends[1] - ends[0])
     boxes = np.concatenate([centers - 0.1, centers + 0.1], -1).astype(np.float32)
-    side = (np.arange(spec.image_size) + 0.5) / spec.image_size
-    inside = (side > boxes[..., :2, None]) & (side < boxes[..., 2:, None])
-    numbers = np.arange(1, spec.objects + 1, dtype=np.uint8)[:, None, None]
-    shown = (inside[..., 1, :, None] & inside[..., 0, None, :]) * numbers
     return Batch(
         tuple(f"clip_{row}" for row in range(clips)),
         np.tile(np.arange(frames), (clips, 1)),
         np.ones((clips, frames), np.bool_),
         future=FUTURE,
         rgb=rng.integers(0, 256, shape, np.uint8),
-        ids=shown.max(2) if "ids" in spec.inputs else None,
+        ids=drawn_ids(boxes, spec.image_size) if "ids" in spec.inputs else None,
         boxes=boxes if "boxes" in spec.inputs else None,
     ).to("cpu")
+
+
+def drawn_ids(boxes: NDArray[np.float32], size: int) -> NDArray[np.uint8]:
+    """Return ids of pixels (B, T, size, size) of boxes (B, T, K, 4); later ones cover earlier."""
+    side = (np.arange(size) + 0.5) / size
+    inside = (side > boxes[..., :2, None]) & (side < boxes[..., 2:, None])
+    numbers = np.arange(1, boxes.shape[2] + 1, dtype=np.uint8)[:, None, None]
+    ids: NDArray[np.uint8] = ((inside[..., 1, :, None] & inside[..., 0, None, :]) * numbers).max(2)
+    return ids
 
 
 def speed(names: list[str], repeats: int, device: str, precision: str) -> Rows:

@@ -29,6 +29,7 @@ from physion.readout.shipped import (
 )
 from physion.readout.trees import FRACTION, LEAF, Forest, fit_forest
 from physion.trials.dataset import Dataset
+from physion.trials.files import MOVIE_ALONE
 from physion.trials.index import write_index
 from support.moving_dots import make_dots
 
@@ -230,12 +231,14 @@ def test_looks_and_movies_that_a_pretrained_model_never_saw_are_refused_or_named
     index = Dataset(tmp_path / "dots").index
     pixels = partial(evaluate, "intuition-pixels", tmp_path / "dots", tmp_path / "out")
     write_index(tmp_path / "dots", index.assign(look="free"))
-    with pytest.raises(BadInputError, match=r"the look redyellow, .* is free; .* cue=true"):
+    with pytest.raises(BadInputError, match=r"the look redyellow, .* look free; .* cue=true"):
         pixels()
     assert pixels(options={"cue": True}, dry_run=True).evaluated
     write_index(tmp_path / "dots", index.assign(look="redyellow"))
     (words,) = pixels().warnings
     assert "stored movies of 64 x 64 pixels, and the model sees 96 (" in words
+    write_index(tmp_path / "dots", index.assign(look="free", engine=MOVIE_ALONE))
+    assert "movies were imported, and may not have" in pixels().warnings[-1]
     oblong, _ = unlike_shipped(
         index.assign(width=128), build_model("intuition-pixels").spec, rendered=False
     )

@@ -58,6 +58,7 @@ from physion.readout.tables import (
     write_table,
 )
 from physion.trials.dataset import Dataset, JoinedDataset
+from physion.trials.files import MOVIE_ALONE
 
 NOTHING_TO_FIT = "no trial to fit|one answer only"
 """Notes of `physion.readout.logistic.fit_readout` where it predicts the base rate."""
@@ -286,14 +287,7 @@ class _Evaluate:
             provenance = dataclasses.replace(provenance, model=name)
         if not provenance.inputs:
             provenance = dataclasses.replace(provenance, inputs=", ".join(model.spec.inputs))
-        looks = self._looks()
-        if (look := ask(model, "look")) and looks != {look}:
-            cue = ", or --option cue=true, which takes them from true masks of the first frame"
-            raise BadInputError(
-                f"{provenance.model} finds agent and patient by the colours of the look {look}, "
-                f"but the look of the tested trials is {' and '.join(sorted(looks))}; use trials "
-                f"made with --look {look}{cue if hasattr(model.settings, 'cue') else ''}"
-            )
+        self._check_look(model)
         shipped = None if rules.together else self._shipped(model)
         path = self._table(cell, model, training, provenance, ways, shipped, rules)
         errors_path = self.out / "rollout-errors" / path.name if settings.rollout_errors else None
@@ -394,6 +388,21 @@ class _Evaluate:
         index = self.dataset.index
         return set(index["look"][index["split"] == TESTING])
 
+    def _check_look(self, model: Model) -> None:
+        """Raise `BadInputError` if tested trials have another look than the model needs.
+
+        Of movies that were imported without a motion the look is not known.
+        """
+        index = self.dataset.index
+        tested = index[(index["split"] == TESTING) & (index["engine"] != MOVIE_ALONE)]
+        if (look := ask(model, "look")) and (others := set(tested["look"]) - {look}):
+            cue = ", or --option cue=true, which takes them from true masks of the first frame"
+            raise BadInputError(
+                f"{model.provenance().model} finds agent and patient by the colours of the look "
+                f"{look}, but tested trials have the look {' and '.join(sorted(others))}; use "
+                f"trials made with --look {look}{cue if hasattr(model.settings, 'cue') else ''}"
+            )
+
     def _warnings(
         self, model: Model, splits: Sequence[ScenarioSplit], readouts: Sequence[Readout]
     ) -> tuple[str, ...]:
@@ -403,7 +412,11 @@ class _Evaluate:
         """
         name, rendered = model.provenance().model, self.settings.rendered
         unlike = unlike_shipped(self.dataset.index, model.spec, rendered=rendered)
-        if ask(model, "look"):
+        if look := ask(model, "look"):
+            if self._looks() - {look}:
+                unlike.append(
+                    f"movies were imported, and may not have the colours of the look {look}"
+                )
             return tuple(
                 f"{name}: predictions may be wrong, since it was trained on other trials: {words}"
                 for words in unlike
