@@ -95,7 +95,7 @@ class Shelf:
                         "contact": len(path.contacts.frame) > 0, "recorded_contact": i % 2 == 0,
                         "movie_sha256": "", "observed_movie_sha256": "",
                         "frames": FRAMES, "playback_seconds": FRAMES / 30, "observed_frames": 45,
-                        "observed_contact": False, "look": "redyellow",
+                        "observed_contact": False, "look": "redyellow", "engine": "flight",
                     }
                 )  # fmt: skip
         self.index = pd.DataFrame(rows)
