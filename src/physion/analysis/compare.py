@@ -51,7 +51,8 @@ class PeopleComparison:
     - ``scores``: `measure_table` of every scenario, then of their mean with equal
       weights (NaN if one of them is undefined), with ``kind`` (model or baseline; the computed
       baselines come last in each scenario), ``zone_low``, ``zone_high`` (of single participants)
-      and ``in_zone`` (yes, no, or empty if either is undefined).
+      and ``in_zone`` (yes, no, or empty if either is undefined or the model lacks some of the
+      stimuli of the zone).
     - ``zones``: `human_zones` of every scenario, and for several scenarios also the paper's
       band of r (`released_r_zone`), whose scenario is the mean.
     - ``pairs``: `model_pairs` of every scenario.
@@ -77,7 +78,7 @@ def compare_everywhere(
         One row per model and stimulus with ``model``, ``stimulus`` (canonical name), ``p_contact``,
         ``predicted``. Predictions of stimuli that nobody saw are counted as dropped.
     test
-        Test rows of `Responses`.
+        Test rows of `Responses`. People and baselines are measured on all their stimuli.
     bootstrap
         Draws of participants, and the seed of the halves.
     """
@@ -121,6 +122,8 @@ def _with_zone(scores: pd.DataFrame, zones: pd.DataFrame) -> pd.DataFrame:
     subset = subset.rename(columns={"low": "zone_low", "high": "zone_high"})
     joined = scores.merge(subset, on=["scenario", "measure"], how="left")
     known = joined[["value", "zone_low", "zone_high"]].notna().all(axis=1)
+    # Of each scenario all stimuli that any row has, which are those of the zone.
+    known &= joined["stimuli"] == joined.groupby("scenario")["stimuli"].transform("max")
     inside = joined["value"].between(joined["zone_low"], joined["zone_high"])
     words = inside.map({True: "yes", False: "no"})
     return joined.assign(in_zone=words.where(known, ""))
@@ -232,7 +235,8 @@ def all_results(
         everybody = accuracy_by_stimulus(people.whole.test, draws)
         whole = compare_scores(predictions, everybody, known, **settings)
         predicting = main.stimuli[main.stimuli["readout"] != DETECTION]
-        with_people = compare_everywhere(predicting, test, draws)
+        answered = test[test["stimulus"].isin(main.stimuli["stimulus"])]
+        with_people = compare_everywhere(predicting, answered, draws)
         about_people = fits_of_people(people, progress)
     pooled = pool_comparison(main)
     several = len(main.names) > 1

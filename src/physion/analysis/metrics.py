@@ -573,8 +573,12 @@ def kappa(sample: Sample) -> Array:
     in_measures=True,
 )
 def kappa_gap(sample: Sample) -> Array:
-    """Return the mean kappa with participants minus the mean kappa among participants."""
-    return sample.mean_kappa - sample.kappa_among_people
+    """Return the mean kappa with participants minus the mean kappa among participants.
+
+    NaN for a model that lacks some of the stimuli, on which kappa among people is another one.
+    """
+    gap = sample.mean_kappa - sample.kappa_among_people
+    return np.where(np.isnan(sample.predicted).any(axis=1), np.nan, gap)
 
 
 @register_metric(

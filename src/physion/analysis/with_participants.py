@@ -460,13 +460,15 @@ def measure_table(measured: Sequence[Measured]) -> pd.DataFrame:
 def mean_measures(measured: Sequence[Sequence[Measured]]) -> list[Measured]:
     """Return the means over scenarios, whose people and stimuli are drawn independently.
 
-    ``measured`` holds the rows of each scenario, with the same models in the same order. A mean is
-    NaN if it is undefined in one of the scenarios.
+    ``measured`` holds the rows of each scenario, with the same models in the same order. Scenarios
+    of which a model predicts nothing are left out of its mean, which is NaN if it is undefined in
+    one of the others.
     """
     return [_mean(rows) for rows in zip(*measured, strict=True)]
 
 
 def _mean(rows: Sequence[Measured]) -> Measured:
+    rows = [one for one in rows if one.stimuli] or rows
     values, reasons = {}, {}
     variances: dict[Resampled, dict[str, Variance]] = {what: {} for what in RESAMPLED}
     for measure in rows[0].values:
@@ -508,6 +510,8 @@ def _why(measure: str, k: int, models: Models, answers: ScenarioAnswers) -> str:
     known = ~np.isnan(models.p_contact[k])
     if not known.any():
         return "the model predicts none of the stimuli"
+    if measure == "kappa_gap" and not known.all():
+        return "kappa_gap: kappa among people is of all stimuli, of which the model lacks some"
     if measure in ("r", "r_beyond_outcome"):
         x, y = models.p_contact[k, known], answers.p_yes()[known]
         why = agreement.why_no_r(x, y)
