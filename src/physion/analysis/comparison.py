@@ -368,8 +368,8 @@ def compare_scores(
     draws = bootstrap or Bootstrap()
     rows = name_models(predictions)
     unwanted = {canonical_name(name) for name in exclude}
-    known = _recorded(rows)
-    known |= {canonical_name(name): bool(value) for name, value in (labels or {}).items()}
+    given = {canonical_name(name): bool(value) for name, value in (labels or {}).items()}
+    known = _recorded(rows, given) | given
     _refuse_two_outcomes(rows, known)
     if humans is None:
         people = _nobody(rows, known)
@@ -437,11 +437,20 @@ def _refuse_unknown_stimuli(people: pd.DataFrame) -> None:
             )
 
 
-def _recorded(rows: pd.DataFrame) -> dict[str, bool]:
-    """Return the official outcomes that the predictions contain."""
-    given = rows[rows["recorded_outcome"].notna()].drop_duplicates("stimulus")
-    pairs = zip(given["stimulus"], given["recorded_outcome"], strict=True)
-    return {str(stimulus): bool(value) for stimulus, value in pairs}
+def _recorded(rows: pd.DataFrame, labels: Collection[str]) -> dict[str, bool]:
+    """Return the official outcomes that the predictions contain.
+
+    Raises `BadInputError` if they have two of a stimulus that is not in ``labels``.
+    """
+    known = rows[rows["recorded_outcome"].notna()]
+    each = known.groupby("stimulus")["recorded_outcome"]
+    two = [str(name) for name in each.nunique()[lambda n: n > 1].index if name not in labels]
+    if two:
+        raise BadInputError(
+            f"stimuli have two values of recorded_outcome in the predictions ({len(two)}, the "
+            f"first is {two[0]!r}); correct them, or give the labels"
+        )
+    return {str(name): bool(value) for name, value in each.first().items()}
 
 
 def _nobody(rows: pd.DataFrame, known: Mapping[str, bool]) -> pd.DataFrame:

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from physion.analysis.published.tables import EXPECTED, MODELS, PARTICLES, PublishedTables
-from physion.analysis.scores import MAJORITY, OUTCOME, TWO_PEOPLE, shown_average
+from physion.analysis.scores import MAJORITY, OUTCOME, TWO_PEOPLE, scenario_counts, shown_average
 from physion.core.names import SCENARIOS
 
 MARK = " *"
@@ -22,8 +22,8 @@ MARKED = (
 )
 RESULTS = (
     "row", "group", "readout", "given", "frames", "benchmark", "check", "fit_on", "stimuli",
-    "accuracy", "accuracy_low", "accuracy_high", "r", "r_low", "r_high", "kappa", "kappa_low",
-    "kappa_high", "beyond", "beyond_low", "beyond_high", "source",
+    "scenarios", "accuracy", "accuracy_low", "accuracy_high", "r", "r_low", "r_high", "kappa",
+    "kappa_low", "kappa_high", "beyond", "beyond_low", "beyond_high", "source",
 )  # fmt: skip
 """Columns of the table of results. ``beyond``: r with people beyond the outcome.
 
@@ -31,6 +31,7 @@ RESULTS = (
 - ``frames``: first and last frame that it saw, and how many a second, if its predictions say so.
 - ``benchmark``: rules of the evaluation, v1 or v1.5; ``check``: verdict of a check; ``fit_on``:
   another set, with its digest, that fitted the readout; likewise.
+- ``scenarios``: of how many scenarios the averages are; NaN if published.
 """
 
 SEEN = ("frames", "benchmark", "check", "fit_on")
@@ -147,6 +148,7 @@ def results_table(
         "readout": rows["readout"],
         "given": [one + more for one, more in zip(given, whole, strict=True)],
         "stimuli": rows["stimuli"],
+        "scenarios": rows["model"].map(scenario_counts(scores)),
         "source": "",
     }
     for column in SEEN:
@@ -173,6 +175,17 @@ def frames_with_benchmark(results: pd.DataFrame) -> list[str]:
     """Return benchmark and frames of the rows of a table of results, such as v1: 2 to 44, 5/s."""
     pairs = zip(results["benchmark"], results["frames"], strict=True)
     return [": ".join(filter(None, pair)) for pair in pairs]
+
+
+def scenarios_of_rows(results: pd.DataFrame) -> list[str]:
+    """Return of how many scenarios each row is, such as 3 of 8; empty if all are of equally many.
+
+    Published rows have an empty text.
+    """
+    counts = results["scenarios"]
+    if counts.nunique() < 2:
+        return []
+    return ["" if pd.isna(n) else f"{n:.0f} of {counts.max():.0f}" for n in counts]
 
 
 def fitted_elsewhere(results: pd.DataFrame) -> list[str]:

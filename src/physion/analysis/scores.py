@@ -264,6 +264,12 @@ def shown_average(scores: pd.DataFrame) -> str:
     return POOLED if known.get(POOLED, 0) > known.get(MEAN, 0) else MEAN
 
 
+def scenario_counts(scores: pd.DataFrame) -> pd.Series:
+    """Return the number of scenarios of each model (index) in a table of scores."""
+    own = scores[~scores["scenario"].isin([MEAN, POOLED])]
+    return own.groupby("model")["scenario"].nunique()
+
+
 AVERAGES = {MEAN: "mean over scenarios", POOLED: "all stimuli pooled"}
 """Words for the averages."""
 

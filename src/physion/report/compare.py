@@ -43,6 +43,7 @@ from physion.analysis.results import (
     published_rows,
     results_table,
     says_frames,
+    scenarios_of_rows,
     zone_of_people,
 )
 from physion.analysis.rollout_errors import read_rollout_errors, rollout_error_table
@@ -225,9 +226,9 @@ class CompareResult:
 def as_text(results: pd.DataFrame, *, intervals: bool = True) -> pd.DataFrame:
     """Return a table of results (`results_table`) for a terminal.
 
-    Columns: ``model``, ``given``, ``frames`` with the benchmark, ``check``, ``stimuli`` where their
-    number differs, and ``accuracy``, ``r with people`` and ``kappa`` with their intervals, if these
-    are wanted, as far as they are known.
+    Columns: ``model``, ``given``, ``frames`` with the benchmark, ``check``, ``stimuli`` and
+    ``scenarios`` where their number differs, and ``accuracy``, ``r with people`` and ``kappa`` with
+    their intervals, if these are wanted, as far as they are known.
     """
     table = results[["row"]].set_axis(["model"], axis=1)
     if (results["given"] != "").any():
@@ -237,7 +238,9 @@ def as_text(results: pd.DataFrame, *, intervals: bool = True) -> pd.DataFrame:
     if (results["check"] != "").any():
         table["check"] = results["check"]
     if results["stimuli"].nunique() > 1:
-        table["stimuli"] = results["stimuli"]
+        table["stimuli"] = results["stimuli"].astype("Int64")
+    if partial := scenarios_of_rows(results):
+        table["scenarios"] = partial
     for heading, name in (("accuracy", "accuracy"), ("r with people", "r"), ("kappa", "kappa")):
         if results[name].notna().any():
             kept = results if intervals else results.drop(columns=[f"{name}_low", f"{name}_high"])
@@ -486,6 +489,11 @@ def compare(
     if files:
         if humans is not None:
             raise BadInputError("give averages of people (humans) or their responses, not both")
+        if zone is not None or dominoes != "plain":
+            raise BadInputError(
+                "zone and dominoes are about averages of people; responses have a zone of their "
+                "own, and --where look=redyellow chooses a look"
+            )
         people, methods = _participants(
             files, sessions, rules, labels, expected, simulated, where, attributes,
             settings,
@@ -499,10 +507,10 @@ def compare(
         results = all_results(rows, people=people, progress=progress, **asked, **settings)
     else:
         assert rows is not None
-        about = (sessions, expected, attributes)
+        about = (sessions, rules, expected, attributes)
         if any(one is not None for one in about) or simulated or where:
             raise BadInputError(
-                "sessions, expected, attributes, chosen values (where) and "
+                "sessions, rules, expected, attributes, chosen values (where) and "
                 "simulated participants are about responses: give those"
             )
         if humans is None and not isinstance(labels, Mapping):

@@ -9,7 +9,7 @@ import pandas as pd
 
 from physion.analysis.comparison import Comparison
 from physion.analysis.people.results import PeopleResults
-from physion.analysis.scores import AVERAGES, TWO_PEOPLE, shown_average
+from physion.analysis.scores import AVERAGES, TWO_PEOPLE, scenario_counts, shown_average
 from physion.analysis.tables import MEAN, in_order
 from physion.core.html import Markup, joined
 from physion.report import html, scores
@@ -106,13 +106,14 @@ def _first(inputs: ReportInputs, shown: Mapping[str, Markup]) -> Markup:
 def _sentence(inputs: ReportInputs) -> str:
     """Return who is how accurate, and who is most like people, in one sentence.
 
-    Models that were shown the outcome are left out.
+    Models that were shown the outcome are left out, and those of fewer scenarios than others.
     """
     table = inputs.results()
     comparison = inputs.comparison
     stimuli = comparison.stimuli["stimulus"].nunique()
     scenarios = plural(comparison.stimuli["scenario"].nunique(), "scenario")
     models = table[(table["group"] == "model") & (table["readout"] != "full")]
+    models = models[models["scenarios"] == models["scenarios"].max()]
     words = []
     if comparison.has_people:
         people = table.set_index("row").loc[TWO_PEOPLE]
@@ -179,10 +180,13 @@ def _summary(inputs: ReportInputs) -> Markup:
 def _answer(comparison: Comparison) -> str:
     """Return which model is most accurate and which is most like people, as sentences.
 
-    Models that were shown the outcome are left out. Of few stimuli only pooled scores are known.
+    Models that were shown the outcome are left out, and those of fewer scenarios than others. Of
+    few stimuli only pooled scores are known.
     """
     scores = comparison.all_scores
     models = scores[(scores["kind"] == "model") & (scores["readout"] != "full")]
+    counts = models["model"].map(scenario_counts(models))
+    models = models[counts == counts.max()]
     words = []
     for name, text in (("accuracy", "Most accurate"), ("r", "Most like people")):
         if name not in models or (name == "r" and not comparison.has_people):

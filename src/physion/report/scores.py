@@ -11,7 +11,13 @@ from physion.analysis.compare import tidy_scores
 from physion.analysis.comparison import SETTING, Comparison
 from physion.analysis.metrics import BEYOND_OUTCOME, Metric, score_metrics
 from physion.analysis.model_tests import MixedTable, permutations_of
-from physion.analysis.results import MARKED, fitted_elsewhere, frames_with_benchmark, says_frames
+from physion.analysis.results import (
+    MARKED,
+    fitted_elsewhere,
+    frames_with_benchmark,
+    says_frames,
+    scenarios_of_rows,
+)
 from physion.analysis.scores import AVERAGES, TWO_PEOPLE, runs_table, shown_average
 from physion.analysis.tables import MEAN, POOLED, in_order
 from physion.core.html import Markup, joined
@@ -99,6 +105,7 @@ def results(inputs: ReportInputs) -> Markup:
     chosen = measures if inputs.comparison.has_people else {"accuracy": "accuracy"}
     known = {"frames": frames_with_benchmark(rows)} if says_frames(rows) else {}
     known |= {"check": list(rows["check"])} if (rows["check"] != "").any() else {}
+    known |= {"scenarios": partial} if (partial := scenarios_of_rows(rows)) else {}
     cells = [
         [str(row["row"]), str(row["given"]), *(of[k] for of in known.values()),
          *(_result(row, key) for key in chosen.values())]

@@ -37,6 +37,7 @@ from physion.analysis.tables import (
 )
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.report.compare import compare
+from physion.report.page import _sentence
 
 QUICK = Bootstrap(resamples=200)
 SCENARIOS = {"collide": "pilot_it2_collision_simple_box", "drop": "pilot_it2_drop_simple_box"}
@@ -298,6 +299,38 @@ def test_recorded_outcomes_stand_in_for_labels() -> None:
     assert list(found.changed["stimulus"]) == list(odd)
     given.loc[0, "Recorded Outcome"] = ""
     assert counts(compare_scores(given, people, bootstrap=QUICK).dropped)["", NO_LABEL] == 1
+
+
+def test_two_recorded_outcomes_of_a_stimulus_are_refused() -> None:
+    people = humans()
+    given = predictions(people).assign(**{"Recorded Outcome": list(labels(people).values())})
+    other = predictions(people, "other").assign(**{"Recorded Outcome": True})
+    with pytest.raises(BadInputError, match=r"two values of recorded_outcome .* \(12, the first"):
+        compare_scores(pd.concat([given, other]), people)
+    compared(pd.concat([given, other]), people)  # the labels decide
+
+
+def test_a_model_that_lacks_scenarios_says_so_and_is_not_called_best() -> None:
+    people = humans()
+    right = {name: float(value) for name, value in labels(people).items()}
+    drop = {name: value for name, value in right.items() if "drop" in name}
+    half = {name: 1 - value if name in list(drop)[:3] else value for name, value in right.items()}
+    result = compare({"drop only": drop, "both": half}, humans=people, labels=labels(people))
+    table = result.summary.set_index("model")
+    assert table.loc["drop only", "scenarios"] == "1 of 2"
+    assert table.loc["both", "scenarios"] == "2 of 2"
+    page = _sentence(result.inputs)
+    assert "the model, both, in" in page and "drop only" not in page
+    whole = compare({"both": half}, humans=people, labels=labels(people))
+    assert "scenarios" not in whole.summary
+
+
+def test_options_that_would_be_ignored_are_refused() -> None:
+    with pytest.raises(BadInputError, match="rules, expected"):
+        compare({"m": {"a": 0.1}}, humans=humans(), rules="official-code")
+    for option in ({"dominoes": "redyellow"}, {"zone": Path("zone.csv")}):
+        with pytest.raises(BadInputError, match="about averages of people"):
+            compare({"m": {"a": 0.1}}, responses="trials.csv", **option)  # type: ignore[arg-type]
 
 
 def test_the_zone_is_only_for_whole_scenarios() -> None:

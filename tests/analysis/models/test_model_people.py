@@ -495,3 +495,35 @@ def test_the_average_with_more_numbers_is_shown() -> None:
     assert shown_average(table) == MEAN
     assert shown_average(table.assign(r=[0.5, np.nan, np.nan, 0.5])) == POOLED  # models decide
     assert shown_average(table[table["kind"] == "people"].assign(r=[np.nan, 0.5])) == POOLED
+
+
+def test_people_and_models_are_compared_on_the_predicted_stimuli() -> None:
+    people = analyse_people(study(people=8, stimuli=12, seed=3), bootstrap=FEW)
+    test = people.kept.test
+    first = test.drop_duplicates("stimulus").groupby("scenario")["stimulus"].head(6)
+    chosen = test[test["stimulus"].isin(first) & (test["scenario"] == "collide")]
+    part = chosen.drop_duplicates("stimulus")[["stimulus", "label"]]
+    given = part.assign(model="m", p_contact=0.2 + 0.6 * part["label"], predicted=part["label"])
+    given = given.drop(columns="label").assign(p_contact=lambda t: t["p_contact"] + t.index / 1e4)
+    table = tidy_scores(all_results(given, people=people, bootstrap=FEW))
+    rows = table[table["scenario"] == MEAN].set_index("model")
+    assert (rows["stimuli"] == 6).all() and rows.loc["m", "accuracy"] == 1
+    own = chosen.groupby("stimulus")["correct"].mean().mean()
+    assert rows.loc[TWO_PEOPLE, "accuracy"] == pytest.approx(own)
+    assert rows["human_accuracy"].to_numpy() == pytest.approx(own)
+
+
+def test_a_model_without_a_scenario_has_the_mean_of_the_others() -> None:
+    people = analyse_people(study(people=8, stimuli=12, seed=3), bootstrap=FEW)
+    part = people.kept.test.drop_duplicates("stimulus")
+    given = part[["stimulus"]].assign(
+        model="all", predicted=part["label"], p_contact=0.2 + 0.6 * part["label"]
+    )
+    some = given[part["scenario"] == "collide"].assign(model="some")
+    found = all_results(pd.concat([given, some]), people=people, bootstrap=FEW)
+    table = tidy_scores(found).set_index(["model", "scenario"])
+    assert table.loc[("some", MEAN), "r"] == table.loc[("some", "collide"), "r"]
+    assert found.with_people is not None
+    scores = found.with_people.scores.set_index(["model", "scenario", "measure"])
+    assert scores.loc[("some", MEAN, "kappa"), "stimuli"] == 12
+    assert scores.loc[("some", "collide", "accuracy"), "in_zone"] in ("yes", "no")

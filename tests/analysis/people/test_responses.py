@@ -22,6 +22,8 @@ from physion.analysis.people.responses import (
     SIMULATED,
     TRIAL_COLUMNS,
     check_labels,
+    keep_where,
+    pooling_warnings,
     read_official_responses,
     read_responses,
 )
@@ -285,6 +287,21 @@ def test_official_columns_are_read_with_the_official_offset(tmp_path: Path) -> N
     assert rows["stimulus"].tolist() == [NAMES[1], NAMES[0], NAMES[0], NAMES[1]]
     assert rows["buttons"].tolist() == ["yes-no"] * 2 + ["no-yes"] * 2
     assert rows["participant"].tolist() == ["p", "p", "q", "q"]
+
+
+def test_answers_that_are_taken_together_give_a_warning(tmp_path: Path) -> None:
+    plain = official_file(tmp_path, "human_responses-collision_pilot.csv")
+    names = [f"{name.replace('_0', '-redyellow_0')}_img" for name in NAMES[:2]] * 2
+    red = official_file(tmp_path, "a.csv", gameID=["g3", "g3", "g4", "g4"], stim_ID=names)
+    assert pooling_warnings(read_official_responses([plain]).test) == []
+    both = read_official_responses([plain, red])
+    (warning,) = pooling_warnings(both.test)
+    assert "collide: answers to free and to red and yellow objects" in warning
+    assert pooling_warnings(keep_where(both, ["look=redyellow"]).test) == []
+    test = both.test.assign(look="free")
+    test.loc[test["session"] == "g3", "scenario"] = "drop"
+    (warning,) = pooling_warnings(test)
+    assert warning.startswith("1 of 2 participants answered several scenarios")
 
 
 def test_official_files_of_any_name_know_their_scenario_by_their_stimuli(tmp_path: Path) -> None:

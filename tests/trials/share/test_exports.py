@@ -396,6 +396,14 @@ def test_a_training_on_one_scenario_has_its_official_name(tmp_path: Path) -> Non
     assert rows["scenario"][same].item() == "drape"
 
 
+def test_a_predicted_outcome_that_is_given_is_kept(tmp_path: Path) -> None:
+    rows = pd.read_csv(table(tmp_path / "in" / "m.csv"))
+    rows["predicted"] = ["False", ""] * 4  # empty: P(contact) of .67 decides
+    rows.to_csv(tmp_path / "in" / "m.csv", index=False)
+    (path,) = export_result_tables(tmp_path / "in", tmp_path / "out")
+    assert pd.read_csv(path)["Predicted Outcome"].tolist() == [False, True] * 4
+
+
 def process_model_dataframe(frame: pd.DataFrame) -> pd.DataFrame:
     """``process_model_dataframe`` of ``analysis/analysis_helpers.py`` of the study, its selections.
 

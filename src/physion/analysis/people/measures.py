@@ -193,7 +193,8 @@ def accuracy_by_scenario(test: pd.DataFrame, bootstrap: Bootstrap | None = None)
     accuracy) with ``_low``, ``_high`` (interval of that mean), ``sd`` over people, ``t``, ``df``,
     ``p`` (two-sided, of people's accuracies against 0.5), ``zone_low``, ``zone_high`` (2.5th and
     97.5th percentile of single people), ``consistency`` (mean over stimuli), ``reason``. In row
-    `MEAN` the scenarios' people are drawn independently.
+    `MEAN` the scenarios' people are drawn independently, also if they are the same persons
+    (`pooling_warnings`), who are counted once.
     """
     draws = bootstrap or Bootstrap()
     records, resampled = [], []
@@ -204,7 +205,7 @@ def accuracy_by_scenario(test: pd.DataFrame, bootstrap: Bootstrap | None = None)
     table = pd.DataFrame(records)
     low, high = draws.interval(np.mean(resampled, axis=0))
     mean: dict[str, Any] = {
-        "scenario": MEAN, "people": int(table["people"].sum()),
+        "scenario": MEAN, "people": test["participant"].nunique(),
         "stimuli": int(table["stimuli"].sum()), "accuracy": table["accuracy"].mean(),
         "accuracy_low": low, "accuracy_high": high,
         "consistency": table["consistency"].mean(),

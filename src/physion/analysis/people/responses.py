@@ -437,6 +437,30 @@ def missing_times(responses: Responses) -> pd.DataFrame:
     return _counted(test[test["log_rt"].isna()], "response times", NO_TIME)
 
 
+def pooling_warnings(test: pd.DataFrame) -> list[str]:
+    """Return a warning for answers that an analysis takes together though they may differ.
+
+    These are answers to two looks of one scenario, and answers of one person to several scenarios,
+    whom the mean over scenarios takes for several people. ``test``: test rows of `Responses`.
+    """
+    found = []
+    if "look" in test:
+        looks = test[test["look"] != ""].groupby("scenario", sort=False)["look"].nunique()
+        found += [
+            f"{name}: answers to free and to red and yellow objects are taken together; choose one "
+            "with --where look=free or look=redyellow"
+            for name in looks.index[looks > 1]
+        ]
+    scenarios = test.groupby("participant")["scenario"].nunique()
+    if several := int((scenarios > 1).sum()):
+        found.append(
+            f"{several} of {len(scenarios)} participants answered several scenarios: intervals of "
+            "means over scenarios, and tests of backgrounds, take them for different people in "
+            "each, and say too little of how people differ"
+        )
+    return found
+
+
 def check_labels(responses: Responses, labels: Mapping[str, bool]) -> None:
     """Raise `BadInputError` with the first stimulus whose label contradicts the official one."""
     label_of = responses.trials.drop_duplicates("stimulus").set_index("stimulus")["label"]
@@ -491,6 +515,7 @@ def _file(path: Path) -> pd.DataFrame:
         is_practice |= True
     # Where the number is missing, the order of the rows is the order of the answers.
     order = raw.groupby(["gameID", is_practice], sort=False).cumcount().astype(str)
+    red = raw["stim_ID"].str.contains("-redyellow") | ("-redyellow" in path.name)
     position = raw["trialNum"].where(~raw["trialNum"].str.lower().isin(("", "nan")), order)
     table = pd.DataFrame(
         {
@@ -498,6 +523,7 @@ def _file(path: Path) -> pd.DataFrame:
             "session": raw["gameID"],
             "scenario": _scenario(path, raw["stim_ID"]),
             "stimulus": raw["stim_ID"].map(canonical_name),
+            "look": np.where(red, "redyellow", "free"),
             "phase": np.where(is_practice, "familiarization", "test"),
             "trial": position,
             "response": raw["response"].str.lower().where(raw["response"].str.lower() != "nan", ""),
@@ -558,6 +584,7 @@ CHOSEN_BY = (
     "gender",
     "education",
     "buttons",
+    "look",
     "study",
 )
 """Columns by which sessions can be chosen, in the table of sessions or in the trials."""

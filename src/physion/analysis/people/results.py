@@ -46,6 +46,7 @@ from physion.analysis.people.responses import (
     Participants,
     Responses,
     missing_times,
+    pooling_warnings,
     read_official_responses,
     read_responses,
     with_own_questions,
@@ -244,7 +245,10 @@ def analyse_people(
     )
     tables["left_out"] = pd.concat([kept.dropped, missing_times(kept)], ignore_index=True)
     mark = (REHEARSAL,) if responses.simulated_sessions else ()
-    warnings = (*mark, *completeness_warnings(responses, expected), *large_exclusions(flags))
+    warnings = (
+        *mark, *completeness_warnings(responses, expected), *large_exclusions(flags),
+        *pooling_warnings(kept.test),
+    )  # fmt: skip
     stimuli = frozenset(responses.trials["stimulus"])
     return PeopleResults(kept, whole, rules, tables, warnings, stimuli)
 

@@ -53,8 +53,10 @@ def overview(inputs: ReportInputs) -> Plot | None:
     )
     if inputs.zone is not None:
         table[ZONE] = [value for pair in inputs.zone for value in pair]
-        caption += " Grey: the zone of people, the middle 95 % of participants and of pairs of them"
-        caption += ", mean of the bounds over scenarios."
+        caption += (
+            " Grey: the zone of people of the study on all its stimuli, the middle 95 % of "
+            "participants and of pairs of them, mean of the bounds over scenarios."
+        )
     if (table["group"] == "published").any():
         caption += " Hollow: published for the study's own stimuli, not run here."
     return Plot("overview", caption, table.reset_index(drop=True), overview_figure)
@@ -188,5 +190,5 @@ def _handles(
         hollow = {"markerfacecolor": theme.paper, "color": theme.ink, "marker": "o", **dot}
         handles.append(Line2D([], [], label=words, **hollow))
     if np.isfinite(zone).all():
-        handles.append(Patch(facecolor=theme.zone, alpha=0.7, label="zone of people"))
+        handles.append(Patch(facecolor=theme.zone, alpha=0.7, label="zone of people, all stimuli"))
     return handles

@@ -15,6 +15,7 @@ import pandas as pd
 from physion.core.errors import BadInputError
 from physion.core.files import check_digest, folder_for_writing, write_atomic
 from physion.core.names import NAMES
+from physion.core.tables import Column, check_table
 
 _OURS = {
     "Model": "model",
@@ -48,6 +49,7 @@ NO_DATASET = "none"
 _DATASETS = ("Encoder Training Dataset", "Dynamics Training Dataset", "Readout Train Data")
 EXPERIMENTS = {name: names.experiment for name, names in NAMES.items()}
 """Official name of a scenario."""
+_PREDICTED = Column("predicted", "flag", "Predicted outcome, by default P(contact) above 0.5")
 _READOUTS = {"full": "A", "observed+simulated": "B", "observed": "C"}
 """Official letter of a readout."""
 
@@ -106,6 +108,9 @@ def _official_text(path: Path) -> str | None:
     official["Readout Type"] = official["Readout Type"].replace(_READOUTS)
     official["Predicted Prob_false"] = 1 - probability
     official["Predicted Outcome"] = probability > 0.5
+    if "predicted" in table:
+        given = check_table(table, (_PREDICTED,), str(path))["predicted"]
+        official["Predicted Outcome"] = given.fillna(official["Predicted Outcome"]).astype(bool)
     # A training on all other scenarios is marked by ``no_``.
     official["Dynamics Training Dataset"] = protocol.mask(
         protocol == "all-but", "no_" + scenario
