@@ -311,7 +311,7 @@ def test_the_page_has_both_tables_and_says_why_one_is_missing(
 ) -> None:
     text = scores.scores(with_baseline)
     assert "Beyond the outcome" in text
-    assert "Not known: the predictions have no column observed_contact" in text
+    assert "Not known: the predictions have no values of observed_contact" in text
     alone = scores.scores(make_comparison(with_people=False))
     assert "Beyond the outcome" not in alone and BASELINES not in alone
     assert OUTCOME not in alone.lower()

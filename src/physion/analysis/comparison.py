@@ -200,7 +200,7 @@ def later_scores(stimuli: pd.DataFrame) -> tuple[pd.DataFrame, str]:
     each = stimuli.drop_duplicates("stimulus")
     if each["observed_contact"].isna().all():
         return pd.DataFrame(), (
-            "not known: the predictions have no column observed_contact, so there are no scores "
+            "not known: the predictions have no values of observed_contact, so there are no scores "
             "without such trials"
         )
     observed, later = each["observed_contact"] == True, each["observed_contact"] == False  # noqa: E712

@@ -18,14 +18,15 @@ class Labels:
 
     - ``contact``: they touch in some frame of the trial.
     - ``first_frame``: the first such frame, None without contact.
-    - ``observed``: they touch within the observed frames, so that nothing is left to predict.
+    - ``observed``: they touch within the observed frames, so that nothing is left to predict; None
+      if that is not known, of an imported contact whose frame is not.
     - ``min_distance``: smallest gap between cloth and patient in metres, None without cloth.
     - ``robust``: fraction of jittered simulations with the same outcome, None if not measured.
     """
 
     contact: bool
     first_frame: int | None
-    observed: bool
+    observed: bool | None
     min_distance: float | None = None
     robust: float | None = None
 

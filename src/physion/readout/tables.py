@@ -37,7 +37,7 @@ COLUMNS = (
 - ``check``: verdict of `physion.check`, such as ``passed``; empty if it was not asked for.
 - ``p_contact``: P(contact). ``outcome``: of the trial as it was shown; ``recorded_outcome``: of the
   official recording, empty where there is none; ``observed_contact``: whether agent and patient
-  touched in the observed part already.
+  touched in the observed part already, empty if that is not known.
 - ``decision``: what turned features or rollouts into probabilities. ``readout_c``, ``noise_scale``
   and ``gap_threshold`` (metres): what it fitted.
 - ``train_accuracy``, ``test_accuracy``: means over all folds of a protocol, readout and scenario.
@@ -61,7 +61,8 @@ _NUMBERS = (
 _DTYPES = {
     **dict.fromkeys(COLUMNS, "str"),
     **dict.fromkeys(_NUMBERS, "float64"),
-    **dict.fromkeys(("outcome", "observed_contact"), "bool"),
+    "outcome": "bool",
+    "observed_contact": "boolean",
     **dict.fromkeys(("fit_trials", "fold"), "int64"),
 }
 """Types by column, of which `read_table` reads each column at once."""
@@ -142,6 +143,7 @@ def make_table(
         }
         for trial, p in zip(part.trials, decided.probability, strict=True):
             recorded = truth["recorded_contact"][trial]
+            observed = truth["observed_contact"][trial]
             rows.append(
                 shared
                 | {
@@ -152,7 +154,7 @@ def make_table(
                     "note": "; ".join(filter(None, (part.note, decided.notes.get(trial, "")))),
                     "outcome": bool(truth["contact"][trial]),
                     "recorded_outcome": "" if pd.isna(recorded) else bool(recorded),
-                    "observed_contact": bool(truth["observed_contact"][trial]),
+                    "observed_contact": "" if pd.isna(observed) else bool(observed),
                 }
             )
     table = pd.DataFrame(rows, columns=list(COLUMNS))
@@ -182,7 +184,7 @@ def read_table(path: Path) -> pd.DataFrame:
         path,
         dtype=_DTYPES,  # type: ignore[arg-type]
         keep_default_na=False,
-        na_values={name: [""] for name in _NUMBERS},
+        na_values={name: [""] for name in (*_NUMBERS, "observed_contact")},
     )
 
 

@@ -94,7 +94,7 @@ def causes_line(table: pd.DataFrame) -> str:
 
 def _pairs(predictions: pd.DataFrame) -> pd.DataFrame:
     """Return the measures of each pair; NaN where one does not apply."""
-    table = predictions[~predictions["observed_contact"].astype(bool)].copy()
+    table = predictions[predictions["observed_contact"] == False].copy()  # noqa: E712
     names = [parts_of(name) for name in table["stimulus"]]
     table["base"] = [base for base, _ in names]
     table["change"] = [change.partition(".")[0] for _, change in names]

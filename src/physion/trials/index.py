@@ -51,11 +51,12 @@ _FACTS: Mapping[str, IndexColumn] = {
             "the label: agent and patient touch at some time of the trial; missing if it is not "
             "stored",
         ),
-        ("first_frame", "Int64", "first frame in which they touch; missing without contact"),
+        ("first_frame", "Int64", "first frame in which they touch; missing if not known"),
         (
             "observed_contact",
             "boolean",
-            "they touch already in the observed part; missing without labels",
+            "they touch already in the observed part; missing without labels, and where it is not "
+            "known",
         ),
         ("min_distance", "Float64", "smallest gap between cloth and object, m; missing without"),
         ("robust", "Float64", "fraction of jittered simulations with the same outcome"),

@@ -267,7 +267,7 @@ def test_stimuli_without_a_known_observed_contact_are_left_out_and_counted() -> 
 
 def test_where_observed_contacts_are_not_known_the_settings_say_so() -> None:
     found = compared()
-    assert found.later.empty and "no column observed_contact" in found.settings[SETTING]
+    assert found.later.empty and "no values of observed_contact" in found.settings[SETTING]
     everything = compared(predictions(**{"Observed Contact": True}))
     assert everything.later.empty and "none is left" in everything.settings[SETTING]
 

@@ -596,6 +596,7 @@ def test_core_folders_become_trials_without_motion(core: Path, dataset: Path) ->
     trial, paths, ours = trial_of(core), Dataset(out).paths(RIGID), Dataset(dataset).paths(RIGID)
     assert trial.metadata.engine == "imported: movie alone"
     assert trial.labels.contact and trial.labels.first_frame is None
+    assert trial.labels.observed is None  # whether the contact is in the observed part is not known
     assert trial.metadata.recorded_contact is True
     assert np.isnan(trial.trajectory.positions).all()
     assert paths.movie.read_bytes() == ours.movie.read_bytes()

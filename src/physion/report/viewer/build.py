@@ -256,7 +256,7 @@ def _trial_data(
                 one,
                 trial.scene,
                 trial.metadata.frames,
-                observed=viewer_facts.labels_of(trial).observed,
+                observed=bool(viewer_facts.labels_of(trial).observed),
             )
             for one in imagined
         ]

@@ -418,7 +418,7 @@ def import_movie(job: ImportJob) -> tuple[str, ...]:
     ids = _ids(job, own.size, notes)
     scene, trajectory = _scene(job), _unknown_motion(own.frames)
     first = job.first_frame if job.contact else None
-    labels = Labels(job.contact, first, first is not None and first < OBSERVED_FRAMES)
+    labels = Labels(job.contact, first, _observed(job.contact, first))
     metadata = imported_metadata(
         job,
         scene,
@@ -552,8 +552,14 @@ def _labels(
     contact = first is not None
     if labelled is None:
         contact, first = bool(job.contact), job.first_frame
-    observed = first is not None and first < OBSERVED_FRAMES
-    return replace(labels, contact=contact, first_frame=first, observed=observed)
+    return replace(labels, contact=contact, first_frame=first, observed=_observed(contact, first))
+
+
+def _observed(contact: bool, first: int | None) -> bool | None:
+    """Return whether a contact is observed, by its first frame; None if that is not known."""
+    if first is None:
+        return None if contact else False
+    return first < OBSERVED_FRAMES
 
 
 def _import_hdf5_movies(
