@@ -122,7 +122,7 @@ def _with_zone(scores: pd.DataFrame, zones: pd.DataFrame) -> pd.DataFrame:
     subset = subset.rename(columns={"low": "zone_low", "high": "zone_high"})
     joined = scores.merge(subset, on=["scenario", "measure"], how="left")
     known = joined[["value", "zone_low", "zone_high"]].notna().all(axis=1)
-    # Of each scenario all stimuli that any row has, which are those of the zone.
+    # The zone is of all stimuli of the scenario that any row has.
     known &= joined["stimuli"] == joined.groupby("scenario")["stimuli"].transform("max")
     inside = joined["value"].between(joined["zone_low"], joined["zone_high"])
     words = inside.map({True: "yes", False: "no"})

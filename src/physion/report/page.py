@@ -106,7 +106,7 @@ def _first(inputs: ReportInputs, shown: Mapping[str, Markup]) -> Markup:
 def _sentence(inputs: ReportInputs) -> str:
     """Return who is how accurate, and who is most like people, in one sentence.
 
-    Models that were shown the outcome are left out, and those of fewer scenarios than others.
+    Models that were shown the outcome are left out, and models of fewer scenarios than others.
     """
     table = inputs.results()
     comparison = inputs.comparison
@@ -180,7 +180,7 @@ def _summary(inputs: ReportInputs) -> Markup:
 def _answer(comparison: Comparison) -> str:
     """Return which model is most accurate and which is most like people, as sentences.
 
-    Models that were shown the outcome are left out, and those of fewer scenarios than others. Of
+    Models that were shown the outcome are left out, and models of fewer scenarios than others. Of
     few stimuli only pooled scores are known.
     """
     scores = comparison.all_scores
