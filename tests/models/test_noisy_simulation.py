@@ -32,7 +32,17 @@ from physion.models.noisy_simulation import (
 from physion.numerics.elementary import exp_of, standard_normal
 from physion.physics.engine import make_engine, simulate
 from physion.physics.trajectory import Contacts, State, Trajectory
-from physion.scenes.scene import Body, Camera, Cloth, Joint, Push, Roles, Scene, SurfaceMaterial
+from physion.scenes.scene import (
+    Body,
+    BodyEvent,
+    Camera,
+    Cloth,
+    Joint,
+    Push,
+    Roles,
+    Scene,
+    SurfaceMaterial,
+)
 from support.paths import ROOT
 
 FRAMES = 120
@@ -444,6 +454,23 @@ def test_with_the_real_engine_hit_and_miss_differ() -> None:
         assert isinstance(real, NoisySimulation)
         answers.append(fraction(real, trial, truth))
     assert answers == [1.0, 0.0]
+
+
+@pytest.mark.parametrize("contact", [0.0, 0.1])
+def test_a_body_that_appeared_before_the_simulation_touches(contact: float) -> None:
+    late = replace(
+        falling(0.0), events=(BodyEvent(40, falling(0.0).roles.agent, "appear"),), pushes=()
+    )
+    real = build_model(
+        "noisy-simulation", samples=2, position=0.0, velocity=0.0, mass=0.0, contact=contact
+    )
+    assert isinstance(real, NoisySimulation)
+    assert fraction(real, late, simulate(late)) == 1.0
+
+
+def test_one_scale_that_is_given_is_the_scale_of_predictions() -> None:
+    assert build_model("noisy-simulation", scale=3.0).arguments == {"scale": (3.0,)}
+    assert build_model("noisy-simulation", scale=3.0, scales=[1, 2]).arguments["scale"] == (1, 2)
 
 
 # Levels of noise that were fitted to outcomes and to people, and the models that use them.

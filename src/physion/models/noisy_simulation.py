@@ -41,7 +41,7 @@ from physion.numerics.elementary import cos, exp, sin, standard_normal
 from physion.numerics.linear_algebra import norm
 from physion.numerics.rotations import multiply_quaternions
 from physion.physics.engine import DEFAULT_ENGINE, Engine, make_engine, simulate_many
-from physion.physics.labels import label_contact
+from physion.physics.labels import contact_frames, label_contact
 from physion.physics.trajectory import State, Trajectory
 from physion.scenes.scene import OBSERVED_FRAMES, Body, Roles, Scene, SurfaceMaterial
 
@@ -207,9 +207,11 @@ def simulate_contacts(
         states = [state for _, state in starts]
         paths = _simulate(scenes, states, engine)
         if levels.contact > 0:
-            paths = _with_contact_noise(scenes, states, paths, levels.contact * scale, seed, engine)
+            level = levels.contact * scale
+            paths, states = _with_contact_noise(scenes, states, paths, level, seed, engine)
         found = [
-            label_contact(scene, path).contact for scene, path in zip(scenes, paths, strict=True)
+            len(contact_frames(scene, path, state.frame)) > 0
+            for scene, path, state in zip(scenes, paths, states, strict=True)
         ]
     if levels.lapse > 0:
         for sample in range(samples):
@@ -302,8 +304,11 @@ def _with_contact_noise(
     level: float,
     seed: int,
     engine: Engine,
-) -> list[Trajectory]:
-    """Simulate again from every new contact of a simulation, with noise of the velocities there."""
+) -> tuple[list[Trajectory], list[State]]:
+    """Simulate again from every new contact of a simulation, with noise of the velocities there.
+
+    Returns the last simulations and the states that they start from.
+    """
     results, starts = list(paths), list(states)
     known = [_pairs(path, 0) for path in results]
     rngs = [_generator(s, seed, sample, "contacts") for sample, s in enumerate(scenes)]
@@ -326,7 +331,7 @@ def _with_contact_noise(
         for i, path in zip(again, paths, strict=True):
             results[i] = path
         active = again
-    return results
+    return results, starts
 
 
 def _pairs(path: Trajectory, frame: int) -> set[tuple[int, int]]:
@@ -421,7 +426,8 @@ class NoisySimulationSettings(NoiseLevels, ModelSettings):
 
     ``noisy-simulation-outcomes`` and ``noisy-simulation-people`` take no levels: theirs are fitted.
 
-    - ``scale``: factor of all standard deviations.
+    - ``scale``: factor of all standard deviations; if it is given, ``scales`` has only this value,
+      unless they are given, too.
     - ``scales``: values of ``scale`` among which a decision chooses; with one value nothing is
       fitted.
     - ``samples``: simulations per trial. ``engine``: name of the engine. ``seed``: of the noise.
@@ -439,7 +445,9 @@ class NoisySimulationSettings(NoiseLevels, ModelSettings):
 
     @classmethod
     def defaults(cls, model: str, options: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return the settings of simulations with fitted noise, which have one scale."""
+        """Return one scale where it is given, and for simulations with fitted noise."""
+        if "scale" in options:
+            return {"scales": (float(options["scale"]),)}
         return {} if model == NAME else {"scales": (1.0,)}
 
     @property

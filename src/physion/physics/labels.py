@@ -31,11 +31,12 @@ class Labels:
     robust: float | None = None
 
 
-def contact_frames(scene: Scene, trajectory: Trajectory) -> Ints:
-    """Return the sorted frames in which agent and patient touch.
+def contact_frames(scene: Scene, trajectory: Trajectory, start: int = 0) -> Ints:
+    """Return the sorted frames of the trajectory in which agent and patient touch.
 
     Between bodies, those with a contact; between a cloth and a body, those with a gap below
-    `CLOTH_CONTACT_GAP`. A body that is absent touches nothing.
+    `CLOTH_CONTACT_GAP`. A body that is absent touches nothing; ``start`` is the frame of the scene
+    that the trajectory begins with.
     """
     agent, patient = scene.index(scene.roles.agent), scene.index(scene.roles.patient)
     if max(agent, patient) < len(scene.bodies):
@@ -45,7 +46,7 @@ def contact_frames(scene: Scene, trajectory: Trajectory) -> Ints:
         frames = np.flatnonzero(gaps < CLOTH_CONTACT_GAP).astype(np.int32)
     if not scene.events:
         return frames
-    present = [scene.present(frame) for frame in frames.tolist()]
+    present = [scene.present(start + frame) for frame in frames.tolist()]
     both = np.array([there[agent] and there[patient] for there in present], np.bool_)
     return np.asarray(frames[both])
 

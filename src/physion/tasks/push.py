@@ -58,7 +58,8 @@ class PushEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     scenario
         One of `SCENARIOS`.
     preset
-        Preset that scenes are sampled from; by default the scenario's first.
+        Preset that scenes are sampled from; by default, as in `sample_scene`, the default
+        parameters of the scenario.
     observation
         ``states``: (16 * 13,) as in `physion.trials.share.lerobot`, agent and patient first;
         ``pixels``: (size, size, 3) in sRGB. At the start, and at the end of the trial.

@@ -61,16 +61,20 @@ def centroids(trial: Trial) -> Floats:
     `Trajectory.velocities` is the velocity of a body's centre, which its collision hulls give; the
     centre of a cloth is the mean of its vertices.
     """
-    scene, motion = trial.scene, trial.trajectory
+    motion = trial.trajectory
+    arms = rotate_vectors(motion.rotations.astype(np.float64), mass_centers(trial.scene))
+    rigid = motion.positions + arms
+    sheets = [part.mean(axis=1, dtype=np.float64) for part in _cloth_parts(trial)]
+    return np.concatenate([rigid, *(s[:, None] for s in sheets)], axis=1).astype(np.float32)
+
+
+def mass_centers(scene: Scene) -> Matrix:
+    """Return the centres of mass (B, 3) of rigid bodies, from their pivots, in their own axes."""
     masses = [
         hull_mass([piece.corners for piece in collision_hulls(b.shape, b.scale)], b.mass)
         for b in scene.bodies
     ]
-    centers = np.array([mass.center for mass in masses]).reshape(-1, 3)
-    arms = rotate_vectors(motion.rotations.astype(np.float64), centers)
-    rigid = motion.positions + arms
-    sheets = [part.mean(axis=1, dtype=np.float64) for part in _cloth_parts(trial)]
-    return np.concatenate([rigid, *(s[:, None] for s in sheets)], axis=1).astype(np.float32)
+    return np.array([mass.center for mass in masses]).reshape(-1, 3)
 
 
 def contact_table(trial: Trial) -> pd.DataFrame:

@@ -35,6 +35,8 @@ from physion.trials.official.export_folder import export_official
 from physion.trials.official.import_folder import import_official
 from physion.trials.official.names import decode_depth
 from physion.trials.official.read_file import MotionReader, OfficialFile, SceneReader
+from physion.trials.share.gltf import export_gltf
+from physion.trials.share.lerobot import export_lerobot
 from physion.trials.trial_file import Trial, TrialWriter
 from physion.trials.video import count_frames, encode_movie, read_frames
 from support.moving_dots import draw
@@ -663,6 +665,9 @@ def test_what_has_no_motion_is_not_exported(core: Path, tmp_path: Path) -> None:
     )
     assert set(report.failed) == {RIGID, CLOTH} and "motion" in report.failed[RIGID]
     assert not list((tmp_path / "out").rglob("*.hdf5"))
+    for export in (export_lerobot, export_gltf):
+        with pytest.raises(BadInputError, match="imported as a movie, without motion"):
+            export(core.with_name("Physion-in"), tmp_path / export.__name__)
 
 
 def test_a_movie_without_label_fails_without_the_others(core: Path) -> None:

@@ -21,15 +21,17 @@ import trimesh
 from physion.cli.main import main
 from physion.core.errors import BadInputError, MissingExtraError
 from physion.numerics.rotations import rotate_vectors
+from physion.physics.engine import simulate
 from physion.physics.trajectory import Trajectory
-from physion.scenes.scene import GRAVITY, BodyEvent, Scene
+from physion.scenes.scene import GRAVITY, Body, BodyEvent, Camera, Ending, Push, Roles, Scene
 from physion.scenes.shapes.primitives import shape
 from physion.trials.dataset import Dataset
 from physion.trials.share.card import about_states
 from physion.trials.share.gltf import export_gltf, motion_gltf, trial_gltf
 from physion.trials.share.lance import export_lance
-from physion.trials.share.lerobot import CAMERA, export_lerobot, states_of
+from physion.trials.share.lerobot import CAMERA, actions_of, export_lerobot, states_of
 from physion.trials.share.result_tables import _OURS, export_result_tables
+from physion.trials.state import centroids
 from physion.trials.trial_file import Trial
 from support.programs import find_program
 from support.viewer_dataset import FRAMES, PLANS, make_dataset, make_scene, make_trajectory
@@ -323,7 +325,8 @@ def test_frames_hold_states_pushes_and_the_outcome(source: Path, exported: Path)
     assert states[0, 0, 0, 2] == pytest.approx(1.2)
     assert states[0, 9, 0, 9] == pytest.approx(-1 / 0.59, rel=1e-4)
     actions = np.stack(rows["action"]).reshape(4, FRAMES, 7)
-    pushed = [3.0, 4.0, 0.0, *path.positions[6, 0], 0.0]
+    center = centroids(Dataset(source).trial("drop_0"))[6, 0]
+    pushed = [3.0, 4.0, 0.0, *center, 0.0]
     assert actions[1, 7] == pytest.approx(pushed)
     others = np.delete(actions[1], 7, axis=0)
     assert (others[:, :6] == 0).all() and (others[:, 6] == -1).all()
@@ -337,6 +340,24 @@ def test_frames_hold_states_pushes_and_the_outcome(source: Path, exported: Path)
         states.reshape(-1, 39).mean(axis=0, dtype=np.float64)
     )
     assert stats[CAMERA]["mean"][0][0][0] == pytest.approx(40 / 255, abs=0.01)
+
+
+def test_pushes_of_one_frame_act_on_centres_after_events() -> None:
+    ball, other = (
+        Body(name, "sphere", (x, 0.0, 0.0), (0.2,) * 3) for name, x in (("a", 0), ("b", 2))
+    )
+    there = BodyEvent(3, "a", "move", (1.0, 0.0, 0.0))
+    scene = Scene(
+        "s", "collide", (ball, other), Roles("a", "b"), Camera((3.0, 0.0, 1.0)),
+        pushes=(Push("b", (0.0, 1.0, 0.0), frame=3), Push("a", (1.0, 0.0, 0.0), frame=3),
+                Push("a", (0.0, 0.0, 2.0))),
+        events=(there,), ending=Ending(10, 10),
+    )  # fmt: skip
+    found = actions_of(scene, simulate(scene), pushes=2).reshape(-1, 2, 7)
+    assert found[3, 0] == pytest.approx([0, 1, 0, 2, 0, 0.1, 1], abs=1e-5)
+    assert found[3, 1] == pytest.approx([1, 0, 0, 1, 0, 0.1, 0], abs=1e-5)
+    assert found[0, 0] == pytest.approx([0, 0, 2, 0, 0, 0.1, 0], abs=1e-5)
+    assert (found[:, :, 6] >= 0).sum() == 3
 
 
 def test_what_cannot_be_exported_is_one_line(source: Path, tmp_path: Path) -> None:

@@ -118,20 +118,20 @@ def cue_tasks(
         for kind in dict.fromkeys(kinds):
             tasks += [
                 TrialTask(meta.dataset, meta.scenario, meta.split, AFTER + meta.index, scene=scene)
-                for scene in four_scenes(trial.scene, kind, run)
+                for scene in four_scenes(trial.scene, kind, run, meta.dataset)
             ]
     return tasks
 
 
-def four_scenes(base: Scene, kind: str, engine: Engine) -> list[Scene]:
+def four_scenes(base: Scene, kind: str, engine: Engine, dataset: str = "") -> list[Scene]:
     """Return the scenes of both tests with both values, in the room of ``base``.
 
-    They are a function of the name of ``base`` and of ``kind``.
+    They are a function of the names of ``dataset`` and ``base`` and of ``kind``.
     """
     for attempt in range(TRIES):
-        found = _draw(base, kind, named_seed("cue", base.name, kind, attempt), engine)
+        found = _draw(base, kind, named_seed("cue", dataset, base.name, kind, attempt), engine)
         if found is not None:
-            return _named(found, base, kind)
+            return _named(found, base, kind, dataset)
     raise PhysionError(
         f"none of {TRIES} scenes of {kind} for {base.name!r} has the four outcomes with the engine "
         f"{engine.name}: leave this kind out, or choose another engine"
@@ -142,12 +142,12 @@ Scenes = dict[tuple[str, str], Scene]
 """Scenes by test and value."""
 
 
-def _named(made: Scenes, base: Scene, kind: str) -> list[Scene]:
+def _named(made: Scenes, base: Scene, kind: str, dataset: str) -> list[Scene]:
     """Return scenes by test and value with their names, whose numbers tell nothing."""
     colors = next(iter(made.values())).physics_digest()
     scenes = []
-    for number, test in enumerate(_shuffled(TESTS, base.name, kind)):
-        for place, value in enumerate(_shuffled(VALUES[kind], base.name, kind, test)):
+    for number, test in enumerate(_shuffled(TESTS, dataset, base.name, kind)):
+        for place, value in enumerate(_shuffled(VALUES[kind], dataset, base.name, kind, test)):
             known = {WHATIF: f"{kind}.{test}.{value}", "base": base.name, COLORS_OF: colors}
             name = f"{base.name}{MARK}{kind}.{number}.{place}"
             scenes.append(replace(made[test, value], name=name, parameters=known))

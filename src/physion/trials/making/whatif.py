@@ -4,7 +4,8 @@ A variant of a trial is a trial of its own in the same split, called ``TRIAL+KIN
 
 - ``remove``: without one body, for each body that is neither agent nor patient nor scenery;
 - ``mass``: the agent with a quarter or four times its mass;
-- ``friction``: all bodies but scenery with a quarter or four times their friction, at most 1;
+- ``friction``: all bodies but scenery with a quarter or four times their friction, at most 1,
+  where it is not above 1 already;
 - ``push``: half the push, or one and a half times it.
 
 All else is equal: poses at the start, camera, colours. ``parameters`` of its scene hold ``whatif``
@@ -139,7 +140,9 @@ def _frictions(scene: Scene) -> Iterator[tuple[str, Scene]]:
 
 def _rubbed(body: Body, factor: float) -> Body:
     old = body.contact
-    static, dynamic = (min(f * factor, 1.0) for f in (old.static_friction, old.dynamic_friction))
+    pair = old.static_friction, old.dynamic_friction
+    # At most 1, but no friction falls where it should rise: of zones it may be above 1 already.
+    static, dynamic = (min(f * factor, max(f, 1.0)) for f in pair)
     return replace(body, contact=replace(old, static_friction=static, dynamic_friction=dynamic))
 
 

@@ -25,7 +25,7 @@ from physion.core.files import folder_for_writing, write_atomic
 from physion.core.tables import markdown_table
 from physion.physics.replay import RECORDED_OUTCOMES
 from physion.trials.dataset import indexed_file
-from physion.trials.files import INDEX
+from physion.trials.files import INDEX, MOVIE_ALONE
 from physion.trials.index import INDEX_COLUMNS
 from physion.trials.share.croissant import (
     SCENARIO_MEANINGS,
@@ -181,6 +181,16 @@ def about_states(engines: Iterable[str]) -> str:
             )
         sentences.append(found)
     return " ".join(sentences)
+
+
+def refuse_movies(index: pd.DataFrame) -> None:
+    """Raise `BadInputError` if trials (rows of an index, by name) were imported without motion."""
+    still = index.index[index["engine"] == MOVIE_ALONE]
+    if len(still):
+        raise BadInputError(
+            f"trial {still[0]!r} was imported as a movie, without motion: nothing can be exported "
+            "but movies (--layout card)"
+        )
 
 
 def check_readme(out: Path, title: str) -> None:

@@ -39,7 +39,7 @@ from physion.physics.trajectory import Trajectory
 from physion.rendering.triangles import solid, surface_of
 from physion.scenes.scene import FRAME_TIME, GRAVITY, Camera, Look, Scene
 from physion.trials.dataset import Dataset
-from physion.trials.share.card import check_readme, write_readme
+from physion.trials.share.card import check_readme, refuse_movies, write_readme
 from physion.trials.trial_file import Trial
 
 CLOTH_KEYS = 60
@@ -89,10 +89,11 @@ def export_gltf(
     Return the paths of all files.
 
     ``split``, ``scenario``: only these. ``verify``: whether trial files are compared with the
-    index. Raises `BadInputError` if no trial is chosen or one is damaged.
+    index. Raises `BadInputError` if no trial is chosen, or one is damaged or has no motion.
     """
     dataset = Dataset(folder, verify=verify)
     trials = dataset.chosen(split, scenario)
+    refuse_movies(dataset.index.set_index("trial").loc[trials])
     check_readme(out, TITLE)
     made = []
     for name in tracked(trials, "glTF files", len(trials), progress):

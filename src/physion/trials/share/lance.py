@@ -31,13 +31,21 @@ from physion.core.errors import BadInputError, MissingExtraError
 from physion.core.files import folder_for_writing, new_folder
 from physion.trials.dataset import Dataset
 from physion.trials.share.card import check_readme, write_readme
-from physion.trials.share.lerobot import ACTION, NAMES, actions_of, labelled, states_of
+from physion.trials.share.lerobot import (
+    ACTION,
+    NAMES,
+    UNITS,
+    actions_of,
+    labelled,
+    most_of,
+    states_of,
+)
 
 TABLE, EPISODES = "trials.lance", "trials_episodes.lance"
 TITLE = "# Physion trials as tables of Lance"
 README = (
     f"`stable_worldmodel.data.load_dataset('{TABLE}')` reads `{TABLE}`, one row for each frame; "
-    f"`{EPISODES}` has one row for each trial."
+    f"`{EPISODES}` has one row for each trial. {UNITS}"
 )
 QUALITY = 95
 """Quality of the pictures, as stable-worldmodel writes them."""
@@ -59,8 +67,9 @@ def export_lance(
     Raises
     ------
     BadInputError
-        If no trial is chosen, one has no label or no movie, its movie has another number of frames
-        than its motion, or the tables are there already. No table is written then.
+        If no trial is chosen, one has no motion, label or movie, the frame of a contact is not
+        known, a movie has another number of frames than the motion, or the tables are there
+        already. No table is written then.
     MissingExtraError
         If pylance is not installed.
     """
@@ -74,8 +83,10 @@ def export_lance(
             raise BadInputError(f"{path} is there already: delete it, or give another folder")
     check_readme(out, TITLE)
     with folder_for_writing(out):
-        slots = max(len(dataset.trial(name).scene.names()) for name in names)
-        sizes = {"state": slots * len(NAMES), "action": len(ACTION), "success": 1, "done": 1}
+        slots, pushes = most_of(dataset, names)
+        sizes = {
+            "state": slots * len(NAMES), "action": pushes * len(ACTION), "success": 1, "done": 1
+        }  # fmt: skip
         schema = pa.schema(
             {"episode_idx": pa.int32(), "step_idx": pa.int32(), "pixels": pa.binary()}
             | {name: pa.list_(pa.float32(), size) for name, size in sizes.items()}
@@ -93,7 +104,7 @@ def export_lance(
 
         def batches() -> Iterator[pa.RecordBatch]:
             for number, name in enumerate(tracked(names, "episodes", len(names), progress)):
-                columns, row = _episode(dataset, name, slots)
+                columns, row = _episode(dataset, name, slots, pushes)
                 frames = len(columns["pixels"])
                 columns["episode_idx"] = [number] * frames
                 columns["step_idx"] = list(range(frames))
@@ -126,7 +137,9 @@ def _lift(folder: Path) -> None:
     (folder / "table").rmdir()
 
 
-def _episode(dataset: Dataset, name: str, slots: int) -> tuple[dict[str, Any], dict[str, Any]]:
+def _episode(
+    dataset: Dataset, name: str, slots: int, pushes: int
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the columns of the frames of a trial, and what is known of the trial."""
     if dataset.file(name, "movie") is None:
         raise BadInputError(f"trial {name!r} has no movie: make the trials without --no-movies")
@@ -141,7 +154,7 @@ def _episode(dataset: Dataset, name: str, slots: int) -> tuple[dict[str, Any], d
     columns = {
         "pixels": [_jpeg(picture) for picture in pictures],
         "state": list(states),
-        "action": list(actions_of(trial.scene, trial.trajectory)),
+        "action": list(actions_of(trial.scene, trial.trajectory, pushes)),
         "success": list((place >= first).astype(np.float32)),
         "done": list((place == frames - 1).astype(np.float32)),
     }

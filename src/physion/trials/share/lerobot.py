@@ -18,9 +18,11 @@ Features of a frame, besides those that every such dataset has:
   y, z), velocity of its centre of mass (m/s) and angular velocity (rad/s); first the agent, then
   the patient, then the others in the order of the scene, and zeros up to the largest number S of
   objects in the dataset. A cloth is given by the mean of its vertices, without rotation.
-- ``action`` (7): impulse (newton seconds) given just before this frame, point at which (metres, the
-  centre of mass if the scene names none), and place in the state of the object that gets it; zeros
-  and -1 for none.
+- ``action`` (P * 7): for each push just before this frame its impulse (newton seconds), point
+  (metres, the centre of mass if the scene names none), and place in the state of the object that
+  gets it; zeros and -1 for none, up to the largest number P of pushes in a frame of the dataset.
+- ``timestamp``: seconds of the movie. Frames are `FRAME_TIME` seconds of physics apart, and
+  velocities are per second of physics.
 - ``next.success``: agent and patient have touched, in this frame or before. ``next.done``: the last
   frame.
 
@@ -32,6 +34,8 @@ LeRobotDataset v3.0, https://huggingface.co/docs/lerobot/lerobot-dataset-v3
 from __future__ import annotations
 
 import json
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -45,12 +49,14 @@ from numpy.typing import NDArray
 from physion.compute.tasks import Progress, tracked
 from physion.core.errors import BadInputError
 from physion.core.files import folder_for_writing, remove_leftovers, write_atomic
+from physion.numerics.rotations import rotate_vectors
 from physion.physics.trajectory import Trajectory
 from physion.scenes.scene import FRAME_TIME, Scene
 from physion.trials.dataset import Dataset
 from physion.trials.making.pairs import without_pairs
-from physion.trials.share.card import check_readme, write_readme
+from physion.trials.share.card import check_readme, refuse_movies, write_readme
 from physion.trials.share.questions import WORDINGS
+from physion.trials.state import mass_centers
 from physion.trials.video import open_movie
 
 VERSION = "v3.0"
@@ -64,9 +70,13 @@ NAMES = (
 ACTION = ("impulse_x", "impulse_y", "impulse_z", "point_x", "point_y", "point_z", "object")
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 TITLE = "# Physion trials as a LeRobot dataset"
+UNITS = (
+    f"Frames are {FRAME_TIME} s of physics apart, and velocities are metres and radians per second "
+    "of physics; movies are slower, or as fast."
+)
 README = (
     "Each trial is an episode; `meta/info.json` names the columns. `LeRobotDataset` of LeRobot "
-    "opens the folder."
+    f"opens the folder. {UNITS} `timestamp` is the time in the movie."
 )
 QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
 
@@ -87,7 +97,8 @@ def export_lerobot(
     Raises
     ------
     BadInputError
-        If no trial is chosen, one has no label or no movie, or movies differ in size or rate.
+        If no trial is chosen, one has no motion, label or movie, the frame of a contact is not
+        known, or movies differ in size or rate.
     """
     dataset, names = labelled(folder, split, scenario, verify=verify)
     index = dataset.index.set_index("trial")
@@ -102,13 +113,20 @@ def export_lerobot(
 def labelled(
     folder: Path, split: str | None, scenario: str | None, *, verify: bool
 ) -> tuple[Dataset, list[str]]:
-    """Return a dataset without pairs and its chosen trials, by split; all must have labels."""
+    """Return a dataset without pairs and its chosen trials, by split.
+
+    All must have a motion, and labels with the frame of a contact.
+    """
     dataset = without_pairs(Dataset(folder, verify=verify))
     index = dataset.index.sort_values("split", kind="stable").set_index("trial")
     chosen = set(dataset.chosen(split, scenario))
     names = [str(name) for name in index.index if name in chosen]
     if unlabelled := [name for name in names if pd.isna(index.loc[name, "contact"])]:
         raise BadInputError(f"trial {unlabelled[0]!r} has no label: choose a split with labels")
+    refuse_movies(index.loc[names])
+    timeless = index["contact"] & index["first_frame"].isna()
+    if unknown := [name for name in names if timeless[name]]:
+        raise BadInputError(f"trial {unknown[0]!r} has a contact, but its first frame is not known")
     return dataset, names
 
 
@@ -116,11 +134,13 @@ def labelled(
 class _Episodes:
     """What `_write_meta` needs to know of the episodes.
 
-    ``slots``: largest number of objects. ``movie``: height, width, frames per second. ``pictures``:
-    colours of the first one of each episode, (H * W, 3) in [0, 1].
+    ``slots``: largest number of objects; ``pushes``: of pushes in a frame. ``movie``: height,
+    width, frames per second. ``pictures``: colours of the first one of each episode, (H * W, 3) in
+    [0, 1].
     """
 
     slots: int
+    pushes: int
     movie: tuple[int, int, int] | None = None
     rows: list[dict[str, Any]] = field(default_factory=list)
     states: list[NDArray[Any]] = field(default_factory=list)
@@ -132,11 +152,11 @@ def _write_episodes(
     dataset: Dataset, names: list[str], out: Path, progress: Progress | None
 ) -> _Episodes:
     """Write movies and rows of all trials; return what `_write_meta` needs."""
-    episodes = _Episodes(max(len(dataset.trial(name).scene.names()) for name in names))
+    episodes = _Episodes(*most_of(dataset, names))
     schema = pa.schema(
         {
             "observation.state": pa.list_(pa.float32(), episodes.slots * len(NAMES)),
-            "action": pa.list_(pa.float32(), len(ACTION)),
+            "action": pa.list_(pa.float32(), episodes.pushes * len(ACTION)),
             "next.success": pa.bool_(),
             "next.done": pa.bool_(),
             "timestamp": pa.float32(),
@@ -151,7 +171,7 @@ def _write_episodes(
             fps = _copy_movie(dataset, name, number, out, episodes)
             trial = dataset.trial(name)
             states = states_of(trial.scene, trial.trajectory, episodes.slots)
-            actions = actions_of(trial.scene, trial.trajectory)
+            actions = actions_of(trial.scene, trial.trajectory, episodes.pushes)
             start, frames = sum(row["length"] for row in episodes.rows), len(states)
             labels = trial.known_labels()
             first = frames if labels.first_frame is None else labels.first_frame
@@ -242,17 +262,40 @@ def states_of(scene: Scene, path: Trajectory, slots: int) -> NDArray[np.float32]
     return states.reshape(len(path), -1)
 
 
-def actions_of(scene: Scene, path: Trajectory) -> NDArray[np.float32]:
-    """Return what is done to the objects before every frame (F, 7), as in ``action``."""
-    actions = np.zeros((len(path), len(ACTION)), np.float32)
-    actions[:, -1] = -1
-    order = places(scene)
+def most_of(dataset: Dataset, names: Sequence[str]) -> tuple[int, int]:
+    """Return the largest number of objects of trials, and of pushes in a frame, at least 1."""
+    scenes = [dataset.trial(name).scene for name in names]
+    counts = [Counter(push.frame for push in scene.pushes).values() for scene in scenes]
+    most = max((count for each in counts for count in each), default=1)
+    return max(len(scene.names()) for scene in scenes), most
+
+
+def actions_of(scene: Scene, path: Trajectory, pushes: int = 1) -> NDArray[np.float32]:
+    """Return what is done to the objects before every frame (F, pushes * 7), as in ``action``."""
+    actions = np.zeros((len(path), pushes, len(ACTION)), np.float32)
+    actions[:, :, -1] = -1
+    order, count = places(scene), Counter[int]()
     for push in scene.pushes:
         if push.frame < len(path):
             index = scene.index(push.body)
-            point = push.point or path.positions[max(push.frame - 1, 0), index]
-            actions[push.frame] = (*push.impulse, *point, order.index(index))
-    return actions
+            point = push.point or _pushed_center(scene, path, index, push.frame)
+            actions[push.frame, count[push.frame]] = (*push.impulse, *point, order.index(index))
+            count[push.frame] += 1
+    return actions.reshape(len(path), -1)
+
+
+def _pushed_center(scene: Scene, path: Trajectory, index: int, frame: int) -> NDArray[Any]:
+    """Return the centre of mass (3,) of a body before the step to a frame, after its events."""
+    body = scene.bodies[index]
+    position, rotation = np.array(body.position), np.array(body.rotation)
+    if frame > 0:
+        position, rotation = path.positions[frame - 1, index], path.rotations[frame - 1, index]
+    for event in scene.events:
+        if event.body == body.name and event.frame == frame:
+            position = position if event.position is None else np.array(event.position)
+            rotation = rotation if event.rotation is None else np.array(event.rotation)
+    arm = rotate_vectors(rotation[None].astype(np.float64), mass_centers(scene)[index][None])
+    return np.asarray(position + arm[0])
 
 
 # Files about all episodes.
@@ -288,7 +331,14 @@ def _write_meta(out: Path, episodes: _Episodes, splits: list[str]) -> Path:
                 for value in NAMES
             ],
         },
-        "action": {"dtype": "float32", "shape": [len(ACTION)], "names": list(ACTION)},
+        "action": {
+            "dtype": "float32",
+            "shape": [episodes.pushes * len(ACTION)],
+            "names": [
+                *ACTION,
+                *(f"{name}.{push}" for push in range(2, episodes.pushes + 1) for name in ACTION),
+            ],
+        },
         "next.success": {**whole, "dtype": "bool"},
         "next.done": {**whole, "dtype": "bool"},
         "timestamp": {**whole, "dtype": "float32"},
