@@ -103,6 +103,18 @@ def test_stored_trees_answer_as_scikit_learn() -> None:
     assert forest.train_accuracy == np.mean(oracle.predict(rounded(features)) == labels)
 
 
+def test_trees_know_late_features_from_early_ones(tmp_path: Path) -> None:
+    labels = np.arange(40) % 2 == 0
+    features = np.zeros((40, 40_000), np.float32)
+    features[:, 35_000:] = labels[:, None]
+    forest = fit_forest(features, labels, trees=3)
+    assert forest.feature.max() >= 35_000 and forest.train_accuracy == 1
+    made = {(Readout.FULL, "drop"): ShippedReadout(forest, 1, 40_000, 40, "")}
+    with pytest.raises(BadInputError, match="features up to 32767"):
+        write_readouts(tmp_path / "own.safetensors", "0" * 64, "own 123", made)
+    assert not list(tmp_path.iterdir())
+
+
 def stored(folder: Path, values: np.ndarray) -> StoredFeatures:
     """Return features (n, steps, size) in files."""
     files = [

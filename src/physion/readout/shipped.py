@@ -96,8 +96,8 @@ class ShippedReadouts:
         accuracies = facts["train_accuracy"], facts["cv_accuracy"]
         fitted: LinearReadout | Forest
         if f"{name}/feature" in self._tensors:
-            trees = self._tensors[f"{name}/feature"], self._tensors[f"{name}/value"]
-            fitted = Forest(*trees, *accuracies)
+            feature = self._tensors[f"{name}/feature"].astype(np.int32)
+            fitted = Forest(feature, self._tensors[f"{name}/value"], *accuracies)
         else:
             scale = self._tensors[f"{readout.value}/scale"].astype(np.float64) * facts["scale"]
             flat = (self._tensors[f"{name}/weights"] * (scale / _LEVELS)).reshape(-1)
@@ -155,7 +155,7 @@ def write_readouts(
 
     Weights w (T, D) of scenario s become whole numbers q with w = q a_s b_d / 127. With weights in
     the unit of their scenario's root mean square a_s, b_d is the largest of feature d in all steps
-    and scenarios.
+    and scenarios. Raises `BadInputError` for trees on more features than a file can hold.
 
     Parameters
     ----------
@@ -180,7 +180,13 @@ def write_readouts(
             "cv_accuracy": of_fit.cv_accuracy,
         }
         if isinstance(of_fit, Forest):
-            tensors |= {f"{name}/feature": of_fit.feature, f"{name}/value": of_fit.value}
+            feature = of_fit.feature.astype(np.int16)
+            if (feature != of_fit.feature).any():
+                raise BadInputError(
+                    f"trees of {name} compare feature {of_fit.feature.max()}; a file holds "
+                    f"features up to {np.iinfo(np.int16).max}"
+                )
+            tensors |= {f"{name}/feature": feature, f"{name}/value": of_fit.value}
             continue
         rows = of_fit.weights.reshape(-1, one.size)
         unit = float(np.sqrt(np.mean(rows**2))) or 1.0

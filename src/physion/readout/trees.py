@@ -39,13 +39,13 @@ _LEAF = -1
 class Forest:
     """Fitted trees, one after the other, each with every node before its left and right subtree.
 
-    - ``feature`` (nodes,) int16: feature that a node compares, or -1 for a leaf.
+    - ``feature`` (nodes,) int32: feature that a node compares, or -1 for a leaf.
     - ``value`` (nodes,) float16: largest value of the feature that goes left, or, of a leaf, the
       fraction of contacts among its fit trials.
     - ``train_accuracy``, ``cv_accuracy``: on the fit trials, and over folds.
     """
 
-    feature: NDArray[np.int16]
+    feature: NDArray[np.int32]
     value: NDArray[np.float16]
     train_accuracy: float = math.nan
     cv_accuracy: float = math.nan
@@ -101,7 +101,7 @@ def fit_forest(features: NDArray[Any], labels: Booleans, *, trees: int = TREES) 
         chosen.append(np.where(inner, tree.feature, _LEAF))
         values.append(np.where(inner, _below(tree.threshold), contact))
     fitted = Forest(
-        np.concatenate(chosen).astype(np.int16), np.concatenate(values).astype(np.float16)
+        np.concatenate(chosen).astype(np.int32), np.concatenate(values).astype(np.float16)
     )
     accuracy = float(np.mean((fitted.probability(features) > 0.5) == labels))
     return Forest(fitted.feature, fitted.value, accuracy)
