@@ -120,6 +120,15 @@ def test_a_second_run_does_nothing_and_a_damaged_table_is_made_again(
         pd.testing.assert_frame_equal(again.predictions, done.predictions)
 
 
+def test_other_colours_or_scenes_are_another_table(dots: Dataset, tmp_path: Path) -> None:
+    paths = evaluate("chance", dots, tmp_path, dry_run=True).paths
+    for column, value in (("look", "free"), ("trial_file_sha256", "0" * 64)):
+        changed = Dataset(dots.folder)
+        changed.index[column] = value
+        paths += evaluate("chance", changed, tmp_path, dry_run=True).paths
+    assert len(set(paths)) == 3
+
+
 @pytest.mark.slow
 def test_accuracies_are_known_as_soon_as_a_model_has_predicted(dots: Dataset, work: Path) -> None:
     finished: list[EvaluatedModel] = []

@@ -62,15 +62,15 @@ from physion.trials.files import MOVIE_ALONE
 
 NOTHING_TO_FIT = "no trial to fit|one answer only"
 """Notes of `physion.readout.logistic.fit_readout` where it predicts the base rate."""
-_VERSION = 11
+_VERSION = 12
 """To be increased with every change that can alter the table of an evaluation."""
 _NOT_HASHED = (
     "protocols", "seeds", "encoder_batch", "accelerator", "rollout_errors", "twin", "benchmark",
 )  # fmt: skip
 """Settings of where and how an evaluation runs, or of others than this one, or hashed by name."""
 _HASHED_COLUMNS = [
-    "trial", "scenario", "split", "contact", "digest", "movie_sha256", "observed_movie_sha256",
-    "recorded_contact", "observed_contact",
+    "trial", "scenario", "split", "contact", "digest", "look", "trial_file_sha256", "movie_sha256",
+    "observed_movie_sha256", "recorded_contact", "observed_contact",
 ]  # fmt: skip
 """Columns of the index that a table depends on."""
 
