@@ -169,6 +169,26 @@ def test_what_is_known_is_not_computed_again(pairs: Path, tmp_path: Path) -> Non
     pd.testing.assert_frame_equal(first, again)
 
 
+def test_surprises_by_other_colours_are_computed_anew(pairs: Path, tmp_path: Path) -> None:
+    changed = Dataset(pairs)
+    changed.index["look"] = "free"
+    for dataset in (Dataset(pairs), changed):
+        surprise(Knows(1.0, pairs), dataset, tmp_path)
+    assert len(list(tmp_path.rglob("knows*.csv"))) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("column", ["look", "movie_sha256"])
+def test_pixel_statistics_of_other_movies_are_computed_anew(
+    pairs: Path, tmp_path: Path, column: str
+) -> None:
+    changed = Dataset(pairs)
+    changed.index[column] = "free"
+    for dataset in (Dataset(pairs), changed):
+        pixel_statistics(dataset, tmp_path, rendered=True)
+    assert len(list(tmp_path.rglob("pixel-statistics*.csv"))) == 2
+
+
 @pytest.mark.slow
 def test_surprises_with_other_options_are_computed_anew(
     pairs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -17,7 +17,7 @@ that the movies were made of: pairs of one are not independent.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -69,6 +69,8 @@ MEASURES = ("mean", "largest")
 ALL, PIXELS = "all", "pixel-statistics"
 _VERSION = 2
 """To be increased with every change that can alter a surprise."""
+_HASHED_COLUMNS = ["digest", "look", "trial_file_sha256", "movie_sha256"]
+"""Columns of the index that a surprise depends on."""
 STEP = 6
 """Frames of a step, where a model asks for every frame: in one nothing has moved far."""
 _TREES = 100
@@ -184,11 +186,9 @@ def _of_model(
 ) -> pd.DataFrame:
     """Return the surprises of one model, which are kept in ``folder``."""
     origin = check_identity(model)
-    files = dataset.index.set_index("trial")[["digest", "movie_sha256"]]
     # A digest leaves out some settings, such as the number of samples.
     own = repr(ask(model, "settings"))
-    inputs = [_VERSION, __version__, model.digest(), own, settings.seed, settings.rendered]
-    inputs += [[name, *map(str, files.loc[name])] for name in sorted(pairs)]
+    inputs = [model.digest(), own, settings.seed, *_facts(dataset, pairs, settings.rendered)]
     path = folder / f"{origin.model}-{json_digest(inputs)[:16]}.csv"
     if is_whole(path):
         return _read(path)
@@ -214,6 +214,13 @@ def _of_model(
         )
     table = pd.DataFrame(rows, columns=list(COLUMNS))
     return _keep(path, table)
+
+
+def _facts(dataset: Dataset, names: Iterable[str], rendered: bool) -> list[Any]:
+    """Return what a surprise depends on, beside the model."""
+    files = dataset.index.set_index("trial")[_HASHED_COLUMNS]
+    of_files = [[name, *map(str, files.loc[name])] for name in sorted(names)]
+    return [_VERSION, __version__, rendered, *of_files]
 
 
 def _read(path: Path) -> pd.DataFrame:
@@ -374,9 +381,8 @@ def pixel_statistics(
 
     trials = dataset if isinstance(dataset, Dataset) else Dataset(dataset)
     pairs = _pairs(trials)
-    digests = trials.index.set_index("trial")["digest"]
-    inputs = [_VERSION, rendered, [[name, str(digests[name])] for name in sorted(pairs)]]
-    path = Path(out) / "surprise" / f"{PIXELS}-{json_digest(inputs)[:16]}.csv"
+    digest = json_digest(_facts(trials, pairs, rendered))
+    path = Path(out) / "surprise" / f"{PIXELS}-{digest[:16]}.csv"
     if is_whole(path):
         return _read(path)
     source = whole_source(trials, Spec(image_size=48), rendered=rendered)
