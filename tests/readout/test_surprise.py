@@ -13,6 +13,7 @@ import torch
 from torch import nn
 
 import physion
+from physion.cli.evaluate import _print_whatif
 from physion.cli.main import main
 from physion.clips.batch import Batch, Motion, Provenance, Rollout, Spec
 from physion.compute.local import SerialExecutor
@@ -421,4 +422,43 @@ def test_models_are_scored_apart_and_sets_without_variants_not() -> None:
     assert always["accuracy"] == pytest.approx(2 / 6)
     plain = table()
     assert whatif_scores(plain[~plain["stimulus"].str.contains("+", regex=False)]).empty
-    assert list(whatif_scores(table().iloc[:0]).columns)[:3] == ["model", "readout", "change"]
+    assert list(whatif_scores(table().iloc[:0]).columns)[:5] == [
+        "model", "readout", "protocol", "seed", "change",
+    ]  # fmt: skip
+
+
+def test_trainings_of_a_model_are_scored_apart(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = [
+        {"model": "m", "init": init, "readout": "observed", "protocol": "one", "seed": "0",
+         "dynamics_training_dataset": trained, "stimulus": name, "outcome": outcome,
+         "p_contact": outcome == right, "observed_contact": False}
+        for init, trained, right in (("random", "drop", True), ("random", "roll", False),
+                                     ("x.pth", "drop", False))
+        for name, outcome in (("a", True), ("a+remove.x", False))
+    ]  # fmt: skip
+    predictions = pd.DataFrame(rows).astype({"p_contact": float})
+    scores = whatif_scores(predictions)
+    scores = scores[scores["change"] == "all"]
+    assert (scores["pairs"] == 1).all() and (scores["seed"] == "0").all()
+    assert scores.groupby(["init", "dynamics_training_dataset"])["paired"].sum().to_dict() == {
+        ("random", "drop"): 1, ("random", "roll"): 0, ("x.pth", "drop"): 0,
+    }  # fmt: skip
+    _print_whatif(predictions, tmp_path)
+    header = capsys.readouterr().out.splitlines()[1].split()
+    assert header[:4] == ["model", "readout", "init", "dynamics_training_dataset"]
+    assert header[4] == "change", "the protocol is the same in all"
+
+
+def test_initial_weights_of_a_model_are_surprised_apart() -> None:
+    rows = [
+        ("m", init, "drop", f"a{possible}", "a", "vanish", False, 0, possible, value, value)
+        for init, possible, value in (
+            ("random", True, 1.0), ("random", False, 2.0),
+            ("x.pth", True, 2.0), ("x.pth", False, 1.0),
+        )
+    ]  # fmt: skip
+    scores = surprise_scores([pd.DataFrame(rows, columns=list(COLUMNS))])
+    scores = scores[(scores["kind"] == "all") & (scores["hidden"] == "all")]
+    assert scores.set_index("init")["mean"].to_dict() == {"random": 1, "x.pth": 0}

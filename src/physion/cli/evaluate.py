@@ -34,7 +34,7 @@ from physion.readout.evaluation import EvaluatedModel, Evaluation
 from physion.readout.settings import EvaluationSettings, options_by_model
 from physion.readout.surprise import MEASURES as SURPRISES
 from physion.readout.surprise import surprise
-from physion.readout.whatif import MEASURES, causes, causes_line, whatif_scores
+from physion.readout.whatif import MEASURES, TRAINING, causes, causes_line, whatif_scores
 from physion.report.compare import compare
 from physion.trials.dataset import Dataset
 
@@ -199,12 +199,19 @@ def with_errors(scores: pd.DataFrame, name: str) -> list[str]:
     return ["-" if m != m else f"{m:.3f}" if se != se else f"{m:.3f} ({se:.3f})" for m, se in pairs]
 
 
+def _apart(scores: pd.DataFrame) -> list[str]:
+    """Return the columns that tell trainings apart, as far as a model has several values."""
+    columns = [name for name in TRAINING if name in scores]
+    several = scores.groupby("model")[columns].nunique().max() > 1
+    return [name for name in columns if several[name]]
+
+
 def _print_whatif(predictions: pd.DataFrame, out: Path) -> None:
     """Print how predictions change with the scene, if the dataset holds variants of trials."""
     scores = whatif_scores(predictions)
     if scores.empty:
         return
-    shown = scores[["model", "readout", "change", "pairs", "changed"]].copy()
+    shown = scores[["model", "readout", *_apart(scores), "change", "pairs", "changed"]].copy()
     for name in MEASURES:
         shown[name] = with_errors(scores, name)
     print_line(text_table(shown, "One thing changed: mean and standard error over trials"))
@@ -232,7 +239,7 @@ def _print_surprise(scores: pd.DataFrame, failed: Mapping[str, str], options: Op
         return
     for name, reason in failed.items():
         print_line(f"failed: {name}: {reason}")
-    shown = scores[["model", "kind", "hidden", "pairs"]].copy()
+    shown = scores[["model", *_apart(scores), "kind", "hidden", "pairs"]].copy()
     for name in SURPRISES:
         shown[name] = with_errors(scores, name)
     print_line(text_table(shown, "Pairs whose impossible movie surprises more (standard error)"))

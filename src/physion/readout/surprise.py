@@ -334,8 +334,9 @@ def surprise_scores(surprises: Sequence[pd.DataFrame]) -> pd.DataFrame:
     Returns
     -------
     scores
-        ``model``, ``kind`` (and all together), ``hidden`` (``yes``, ``no``, or ``all``), ``pairs``,
-        and for each of `MEASURES` the fraction and ``MEASURE_se``, NaN with less than two trials.
+        ``model``, ``init``, ``kind`` (and all together), ``hidden`` (``yes``, ``no``, or ``all``),
+        ``pairs``, and for each of `MEASURES` the fraction and ``MEASURE_se``, NaN with less than
+        two trials.
     """
     keys = ["model", "init", "base", "kind", "hidden", "first"]
     table = pd.concat([one for one in surprises if len(one)], ignore_index=True)
@@ -345,17 +346,18 @@ def surprise_scores(surprises: Sequence[pd.DataFrame]) -> pd.DataFrame:
         more = joined[f"{measure}_impossible"] - joined[measure]
         joined[measure] = (1 + np.sign(more)) / 2
     rows = []
-    for model, own in joined.groupby("model", sort=False):
+    for (model, init), own in joined.groupby(["model", "init"], sort=False):
         for kind, part in [(ALL, own), *own.groupby("kind")]:
             seen = part["hidden"].astype(bool)
             for hidden, some in ((ALL, part), ("no", part[~seen]), ("yes", part[seen])):
                 if some.empty:
                     continue
-                row = {"model": model, "kind": kind, "hidden": hidden, "pairs": len(some)}
+                row = {"model": model, "init": init, "kind": kind, "hidden": hidden}
+                row["pairs"] = len(some)
                 for measure in MEASURES:
                     row[measure], row[f"{measure}_se"] = mean_over_trials(some, measure)
                 rows.append(row)
-    columns = ["model", "kind", "hidden", "pairs"]
+    columns = ["model", "init", "kind", "hidden", "pairs"]
     columns += [f"{measure}{end}" for measure in MEASURES for end in ("", "_se")]
     return pd.DataFrame(rows, columns=columns)
 

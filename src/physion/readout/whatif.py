@@ -22,6 +22,8 @@ from physion.trials.making.whatif import CUES, pair_of, parts_of
 
 MEASURES = ("accuracy", "paired", "moved", "unmoved")
 ALL = "all"
+TRAINING = ("init", "protocol", "dynamics_training_dataset", "seed")
+"""Columns that tell trainings of one model apart."""
 _NAMED = 6
 """Bodies in a line about removals."""
 
@@ -32,26 +34,27 @@ def whatif_scores(predictions: pd.DataFrame) -> pd.DataFrame:
     Parameters
     ----------
     predictions
-        Tables of `physion.evaluate`, one below the other. Pairs of which a part is missing, or has
-        a contact in the observed part, are left out.
+        Tables of `physion.evaluate`, one below the other; columns of `TRAINING` may be missing.
+        Pairs of which a part is missing, or has a contact in the observed part, are left out.
 
     Returns
     -------
     scores
-        ``model``, ``readout``, ``change``, ``pairs``, ``changed`` (pairs whose outcomes differ),
-        and for each measure its mean and ``MEASURE_se``; NaN where there is no pair, or no second
-        trial for the error. Empty without variants.
+        ``model``, ``readout``, the columns of `TRAINING` that there are, ``change``, ``pairs``,
+        ``changed`` (pairs whose outcomes differ), and for each measure its mean and
+        ``MEASURE_se``; NaN where there is no pair, or no second trial for the error. Empty without
+        variants.
     """
-    names = ["model", "readout", "change", "pairs", "changed"]
+    groups = _groups(predictions)
+    names = [*groups, "change", "pairs", "changed"]
     columns = [*names, *(f"{m}{end}" for m in MEASURES for end in ("", "_se"))]
     pairs = _pairs(predictions)
     if pairs.empty:
         return pd.DataFrame(columns=columns)
-    groups = ["model", "readout", "protocol", "seed"]
     rows = []
-    for (model, readout, *_), own in pairs.groupby(groups, sort=False):
+    for values, own in pairs.groupby(groups, sort=False):
         for change, part in [(ALL, own), *own.groupby("change")]:
-            row = {"model": model, "readout": readout, "change": change, "pairs": len(part)}
+            row = dict(zip(groups, values, strict=True)) | {"change": change, "pairs": len(part)}
             row["changed"] = int(part["moved"].notna().sum())
             for measure in MEASURES:
                 row[measure], row[f"{measure}_se"] = mean_over_trials(part, measure)
@@ -92,6 +95,11 @@ def causes_line(table: pd.DataFrame) -> str:
     )
 
 
+def _groups(predictions: pd.DataFrame) -> list[str]:
+    """Return the columns whose values belong to one training and readout of one model."""
+    return [name for name in ("model", "readout", *TRAINING) if name in predictions]
+
+
 def _pairs(predictions: pd.DataFrame) -> pd.DataFrame:
     """Return the measures of each pair; NaN where one does not apply."""
     table = predictions[predictions["observed_contact"] == False].copy()  # noqa: E712
@@ -100,7 +108,7 @@ def _pairs(predictions: pd.DataFrame) -> pd.DataFrame:
     table["change"] = [change.partition(".")[0] for _, change in names]
     table["pair"] = [pair_of(name)[0] for name in table["stimulus"]]
     changed = np.array([pair_of(name)[1] for name in table["stimulus"]], np.bool_)
-    keys = ["model", "readout", "protocol", "seed", "base", "pair"]
+    keys = [*_groups(predictions), "base", "pair"]
     table[keys] = table[keys].fillna("")
     variant, base = table[changed], table[~changed]
     pairs = variant.merge(base, on=keys, suffixes=("", "_base"))
