@@ -407,6 +407,10 @@ def test_twins_are_shown(made: Dataset, tmp_path: Path) -> None:
     assert done.passed, done.table.to_string()
     assert rows["verdict"]["random twin"].tolist() == [SHOWN, SHOWN]
     assert rows["moved"]["random twin"]["observed"] > 0
+    assert "fitted on these trials" in rows["note"]["random twin"]["observed"]
+    fitted = check("cswm", made, tmp_path, trials=8, accelerator="cpu", readout_from="fit").table
+    fitted = fitted.set_index(["change", "readout"])["accuracy"]
+    assert rows["accuracy"]["random twin"].tolist() == fitted["random twin"].tolist()
     assert set(rows.loc["blob-centroids"].index) == {"observed"}
     assert set(rows["accuracy_changed"].dropna() * 4 % 1) == {0.0}, "of four tested trials"
 

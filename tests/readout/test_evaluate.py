@@ -463,6 +463,25 @@ def test_the_twin_of_a_trained_model_is_not_trained(dots: Dataset, tmp_path: Pat
     assert not list((tmp_path / "training").glob("**/*.safetensors"))
 
 
+@pytest.mark.slow
+def test_a_model_and_its_twin_have_readouts_of_one_kind(dots: Dataset, tmp_path: Path) -> None:
+    """A readout that ships was fitted on more trials than one that is fitted here."""
+    settings = EvaluationSettings(accelerator="cpu", readouts=("observed",))
+    coloured = Dataset(dots.folder)
+    coloured.index["look"] = "redyellow"
+    alone = evaluate("cswm", coloured, tmp_path, settings).predictions
+    assert (alone["fit_trials"] > COUNTS["readout"]).all()
+    both = evaluate("cswm", coloured, tmp_path, settings, twin=True).predictions
+    assert set(both["init"]) > set(alone["init"])
+    assert (both["fit_trials"] == COUNTS["readout"]).all() and (both["fit_on"] == "").all()
+
+
+def test_readouts_that_ship_are_used_where_the_twin_has_them_too() -> None:
+    chosen = choose_models(["pEffNetLite0-mlp", "rpin"])
+    cells = plan_cells(chosen, EvaluationSettings(), lambda _: False, twins=True)
+    assert [cell.chosen.fits for cell in cells] == [False, False, True, True]
+
+
 # --- readouts that are fitted on another dataset ------------------------------------------------
 
 

@@ -397,13 +397,16 @@ class _Check:
         if not asked:
             return []
         found = self._predict(other, self._first, readouts=asked, decision=decision)
-        rows = []
-        for readout, before in self._before.groupby("readout"):
+        own, note, rows = self._before, "", []
+        if name == TWIN and (own["fit_on"] != "").any() and (found["fit_on"] == "").all():
+            own = self._predict(self._model, self._first, readouts=asked, readout_from="fit")
+            note = "both with readouts that are fitted on these trials"
+        for readout, before in own.groupby("readout"):
             if readout in asked:
                 same = found[found["readout"] == readout].set_index("stimulus")["p_contact"]
                 after = same.reindex(before["stimulus"]).to_numpy()
                 rows.append({"change": name, "what": _OTHERS[name], "readout": readout})
-                rows[-1] |= {**_compared(before, after), "verdict": SHOWN, "note": ""}
+                rows[-1] |= {**_compared(before, after), "verdict": SHOWN, "note": note}
         return rows
 
     def _has_pictures(self) -> bool:

@@ -288,7 +288,7 @@ class _Evaluate:
         if not provenance.inputs:
             provenance = dataclasses.replace(provenance, inputs=", ".join(model.spec.inputs))
         self._check_look(model)
-        shipped = None if rules.together else self._shipped(model)
+        shipped = None if rules.together else self._shipped(model, cell.chosen)
         path = self._table(cell, model, training, provenance, ways, shipped, rules)
         errors_path = self.out / "rollout-errors" / path.name if settings.rollout_errors else None
         if errors_path is not None:
@@ -309,7 +309,7 @@ class _Evaluate:
         folds = rules.arrange(planned, settings.scenario)
         splits = [split for fold in folds for split in fold.scenarios]
         features = [readout for readout, way in ways.items() if way is Way.FEATURES]
-        warnings = () if rules.together else self._warnings(model, splits, features)
+        warnings = () if rules.together else self._warnings(model, cell.chosen, splits, features)
         evaluated = dataclasses.replace(evaluated, warnings=warnings)
         if done:
             return evaluated
@@ -372,15 +372,20 @@ class _Evaluate:
             evaluated, path=path, rollout_errors=errors_path, problems=problems
         )
 
-    def _shipped(self, model: Model) -> ShippedReadouts | None:
+    def _shipped(self, model: Model, chosen: ChosenModel) -> ShippedReadouts | None:
         """Return the readouts that ship for a model and may be used; None to fit them."""
-        return self._offered(model) if self._looks() == {"redyellow"} else None
+        return self._offered(model, chosen) if self._looks() == {"redyellow"} else None
 
-    def _offered(self, model: Model) -> ShippedReadouts | None:
+    def _offered(self, model: Model, chosen: ChosenModel) -> ShippedReadouts | None:
         """Return the readouts that ship for a model, unless the settings ask for others."""
         settings = self.settings
         anew = settings.readout_from == "fit" or settings.logistic != LogisticSettings()
-        if anew or self.fit_on or settings.decision not in ("", decision_name(model)):
+        if (
+            anew
+            or chosen.fits
+            or self.fit_on
+            or settings.decision not in ("", decision_name(model))
+        ):
             return None
         return find_readouts(model)
 
@@ -404,7 +409,11 @@ class _Evaluate:
             )
 
     def _warnings(
-        self, model: Model, splits: Sequence[ScenarioSplit], readouts: Sequence[Readout]
+        self,
+        model: Model,
+        chosen: ChosenModel,
+        splits: Sequence[ScenarioSplit],
+        readouts: Sequence[Readout],
     ) -> tuple[str, ...]:
         """Return how the tested trials differ from what weights or readouts that ship have seen.
 
@@ -421,7 +430,7 @@ class _Evaluate:
                 f"{name}: predictions may be wrong, since it was trained on other trials: {words}"
                 for words in unlike
             )
-        offered = self._offered(model)
+        offered = self._offered(model, chosen)
         if offered is None:
             return ()
         pairs = [(offered.find(one, split.scenario), split) for one in readouts for split in splits]

@@ -28,6 +28,7 @@ from physion.models.user_files import is_file_name
 from physion.readout.folds import Protocol
 from physion.readout.logistic import LogisticSettings
 from physion.readout.model_calls import is_network
+from physion.readout.shipped import find_readouts
 from physion.trials.dataset import Dataset
 from physion.trials.making.pairs import without_pairs
 
@@ -93,7 +94,8 @@ class EvaluationSettings(HarnessSettings):
     own."""
     readout_from: Literal["shipped", "fit"] = "shipped"
     """shipped: take a readout of the package where it has one for the model, if trials are red and
-    yellow and the dataset has fewer trials to fit one. fit: fit all readouts on the dataset."""
+    yellow, the dataset has fewer trials to fit one, and its twin, if asked for, has one too. fit:
+    fit all readouts on the dataset."""
     untrained: Annotated[bool, OPTION_ONLY] = False
     """Train no model, and take its weights as they are; the table says untrained."""
     twin: bool = False
@@ -124,12 +126,15 @@ class ChosenModel:
     - ``model``: its name, or the model itself. ``options``: fields of its settings.
     - ``training``: fields of `TrainingSettings` that replace the model's.
     - ``twin``: whether it is the random twin of another model.
+    - ``fits``: whether readouts that ship are not used, since none ships for its twin, or for the
+      model that it is the twin of: readouts of both are fitted on the same trials.
     """
 
     model: str | Model
     options: Mapping[str, Any]
     training: Mapping[str, Any]
     twin: bool = False
+    fits: bool = False
 
     @property
     def name(self) -> str:
@@ -357,13 +362,16 @@ def _with_twins(
     found: list[tuple[ChosenModel, Any]] = []
     names: set[str] = set()
     for model, example in built:
-        found.append((model, example))
         twin = model.random_twin(example)
-        if twin is not None:
-            made = twin.build(seed)
-            if (name := made.provenance().model) not in names:
-                names.add(name)
-                found.append((twin, made))
+        if twin is None:
+            found.append((model, example))
+            continue
+        made = twin.build(seed)
+        fits = not (find_readouts(example) and find_readouts(made))
+        found.append((dataclasses.replace(model, fits=fits), example))
+        if (name := made.provenance().model) not in names:
+            names.add(name)
+            found.append((dataclasses.replace(twin, fits=fits), made))
     return found
 
 
