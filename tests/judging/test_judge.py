@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import shutil
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ from physion.rendering.camera import View
 from physion.scenes.scene import Body, Camera, Roles, Scene
 from physion.scenes.shapes.primitives import shape
 from physion.trials.dataset import Dataset
+from physion.trials.index import write_index
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, plan_dataset
 from physion.trials.share.conditioning import export_conditioning
@@ -112,6 +115,36 @@ def test_movies_are_judged_and_bad_ones_named(
     made = one.stat().st_mtime_ns
     again = judge(generated, dataset.folder, tmp_path, scenario="collide")
     assert again.complete and again.seeds["right"][0] == 1 and one.stat().st_mtime_ns == made
+
+
+def test_trials_with_a_contact_in_the_observed_part_do_not_count(
+    dataset: Dataset, generated: Path, tmp_path: Path
+) -> None:
+    """What is seen in Collide would be wrong: the answer was shown."""
+    folder = tmp_path / "trials"
+    shutil.copytree(dataset.folder, folder)
+    touched = dataset.index.assign(observed_contact=dataset.index["scenario"] == "collide")
+    write_index(folder, touched)
+    done = judge(generated, folder, tmp_path / "out", executor=SerialExecutor())
+    assert (done.seeds.set_index("seed")["right"] == 0).all(), "movies of Drop are missing"
+    assert done.movies.groupby("scenario")["observed_contact"].all().to_dict() == {
+        "collide": True, "drop": False,
+    }  # fmt: skip
+    predictions = pd.read_csv(done.paths["predictions"])
+    assert list(predictions["stimulus"]) == dataset.trials(scenario="drop")
+    (line,) = done.warnings
+    assert line.startswith("1 trial with a contact in the observed part: left out")
+    with pytest.raises(BadInputError, match="observed part of every chosen trial"):
+        judge(generated, folder, tmp_path / "out", scenario="collide")
+
+
+def test_an_agent_that_stays_away_does_not_touch_again(dataset: Dataset) -> None:
+    """The true one touched before; in the movie nothing moves after the observed part."""
+    (trial,) = dataset.trials(scenario="drop")
+    frames = dataset.frames(trial)
+    known = replace(reference(dataset, trial), contacts=np.arange(20, 40, dtype=np.int32))
+    still = np.repeat(frames[:1], len(frames) - FIRST, axis=0)
+    assert not measure(still, 30, FIRST, known)[0]["contact"]
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,7 @@ RATES = (4.0, 240.0)
 """Smallest and largest rate of a movie, frames a second."""
 _MOVIES = {".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".gif"}
 """Endings of files that may be movies."""
-_VERSION = 3
+_VERSION = 4
 """To be increased with every change that can alter a measure."""
 
 
@@ -91,7 +91,8 @@ def judge(
     Raises
     ------
     BadInputError
-        For a card that is missing or of other rules, trials without labels, or no movie at all.
+        For a card that is missing or of other rules, trials without labels or all with a contact in
+        the observed part, or no movie at all.
     UnknownNameError
         For an unknown split or scenario.
     """
@@ -99,6 +100,11 @@ def judge(
     card = _card(folder)
     trials = [item.trial for item in items_of(known, split=split, scenario=scenario)[::2]]
     rows = known.index.set_index("trial").loc[trials]
+    if rows["observed_contact"].all():
+        raise BadInputError(
+            f"agent and patient touch in the observed part of every chosen trial of {dataset}: "
+            "nothing is left to predict; take others"
+        )
     status, digests = _what_is_there(folder, card, trials)
     jobs = {}
     for trial in trials:
@@ -274,6 +280,7 @@ def _collect(
                 "status": found.get("status", failed.get(trial, why)) if why == JUDGED else why,
                 "true_contact": bool(facts.loc[trial, "contact"]),
                 "true_frame": facts.loc[trial, "first_frame"],
+                "observed_contact": bool(facts.loc[trial, "observed_contact"]),
             }
             rows.append(row | dict.fromkeys(COLUMNS) | found.get("measures", {}))
             if "tracks" in found:
@@ -284,7 +291,7 @@ def _collect(
 def _by_seed(movies: pd.DataFrame, card: MovieCard) -> pd.DataFrame:
     """Return the means of each seed, their mean and their standard deviation."""
     judged = movies["status"] == JUDGED
-    right = judged & movies["contact"].eq(movies["true_contact"])
+    right = (judged & movies["contact"].eq(movies["true_contact"]))[~movies["observed_contact"]]
     numbers = movies[[name for name in COLUMNS if name != "contact_frame"]].astype(np.float64)
     lines = []
     for seed in card.seeds:
@@ -299,10 +306,11 @@ def _by_seed(movies: pd.DataFrame, card: MovieCard) -> pd.DataFrame:
 def _predictions(movies: pd.DataFrame, card: MovieCard) -> pd.DataFrame:
     """Return P(contact) by trial: the fraction of its movies with contact; missing ones are wrong.
 
-    With as many movies for as against, the first seed decides.
+    With as many movies for as against, the first seed decides. Trials with a contact in the
+    observed part are left out.
     """
     rows = []
-    for trial, own in movies.groupby("trial", sort=True):
+    for trial, own in movies[~movies["observed_contact"]].groupby("trial", sort=True):
         truth = bool(own["true_contact"].iloc[0])
         votes = [
             bool(contact) if state == JUDGED else not truth

@@ -240,7 +240,7 @@ def _contact(
     touching = np.where(on_path, np.diff(so_far, prepend=before) > 0, seen)
     known = own.distance[np.isfinite(own.distance)]
     return {
-        "contact": bool(touching.any() or before),
+        "contact": bool(touching.any()),
         "contact_frame": round(float(own.frames[touching.argmax()])) if touching.any() else None,
         "contact_seen": bool(seen.any()),
         "on_path": float(on_path.mean()) if len(on_path) else float("nan"),

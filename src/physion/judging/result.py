@@ -64,13 +64,15 @@ class Judged:
 
     - ``card``: what the user says of the movies.
     - ``movies``: one row per trial and seed: ``trial``, ``scenario``, ``seed``, ``status``
-      (*judged*, or why not), ``true_contact``, ``true_frame``, and the measures of `COLUMNS`.
+      (*judged*, or why not), ``true_contact``, ``true_frame``, ``observed_contact`` (whether they
+      truly touch in the observed part already), and the measures of `COLUMNS`.
     - ``seeds``: one row per seed, then *mean* and *sd* over them: ``movies``, ``right`` (fraction
-      of all movies asked for that show the true outcome; missing ones do not), and the means of
-      all measures.
+      of all movies asked for that show the true outcome; missing ones do not; without trials with
+      ``observed_contact``), and the means of all measures.
     - ``complete``: all movies of at least `SEEDS` seeds were judged.
     - ``paths``: tables by name: movies, seeds, tracks (agent's centre and distance by frame, and
-      the true ones), predictions (P(contact) of each trial over its seeds, for `physion.compare`).
+      the true ones), predictions (P(contact) of each trial without ``observed_contact`` over its
+      seeds, for `physion.compare`).
     - ``true``: true movies by trial. ``generated``: folder of the generated ones.
     - ``unknown``: what lies in that folder but is not judged, as paths in it: folders of movies
       that the card does not name, and movies of trials that the dataset does not have.
@@ -114,14 +116,21 @@ class Judged:
 
     @property
     def warnings(self) -> list[str]:
-        """What lies in the folder but is not judged, as at most one line."""
-        if not self.unknown:
-            return []
-        names = ", ".join(self.unknown[:_NAMED]) + (", ..." if len(self.unknown) > _NAMED else "")
-        return [
-            f"not judged, because the card does not name the seed or the dataset has no such trial "
-            f"({len(self.unknown)}): {names}"
-        ]
+        """What lies in the folder but is not judged, and what does not count, a line each."""
+        found = []
+        if self.unknown:
+            more = ", ..." if len(self.unknown) > _NAMED else ""
+            found.append(
+                "not judged, because the card does not name the seed or the dataset has no such "
+                f"trial ({len(self.unknown)}): {', '.join(self.unknown[:_NAMED])}{more}"
+            )
+        left = self.movies["trial"][self.movies["observed_contact"]].nunique()
+        if left:
+            found.append(
+                f"{plural(left, 'trial')} with a contact in the observed part: left out of right "
+                "and of the comparison"
+            )
+        return found
 
 
 def verdict(judged: Judged) -> str:
@@ -139,7 +148,7 @@ def described(judged: Judged) -> pd.DataFrame:
     table = judged.seeds.set_index("seed")
     meanings = {
         "right": "fraction of all movies asked for that show the true outcome; a missing one does "
-        "not",
+        "not; without trials with a contact in the observed part",
         **COLUMNS,
     }
     rows = [
@@ -167,6 +176,7 @@ def _page(judged: Judged) -> str:
     lead = joined(
         [
             paragraph(verdict(judged), "lead"),
+            *(paragraph(text) for text in judged.warnings),
             _table([CARD, ""], pd.DataFrame(facts.items())),
             _table(list(table.columns), table),
         ]
@@ -176,7 +186,8 @@ def _page(judged: Judged) -> str:
         rows = _table(["trial", "seed", "why"], missing[["trial", "seed", "status"]])
         sections.append(Section("Missing movies, which count as wrong", rows))
     left = PAGE_BYTES
-    for scenario, own in judged.movies[judged.movies["status"] == JUDGED].groupby("scenario"):
+    shown = (judged.movies["status"] == JUDGED) & ~judged.movies["observed_contact"]
+    for scenario, own in judged.movies[shown].groupby("scenario"):
         right = own["contact"].astype(bool) == own["true_contact"]
         order = own.assign(right=right).sort_values(["right", "trial"], kind="stable")
         cards = []
