@@ -374,7 +374,7 @@ def rows_of(hits: dict[str, list[bool]], seed: int = 0, **changes: str) -> pd.Da
     rows = [
         {"model": "m", "init": "random", "protocol": "all", "readout": "full", "seed": str(seed),
          "benchmark": "v1", "dynamics_training_dataset": "", "scenario": scenario,
-         "outcome": True, "p_contact": float(hit), **changes}
+         "outcome": True, "recorded_outcome": "", "p_contact": float(hit), **changes}
         for scenario, values in hits.items()
         for hit in values
     ]  # fmt: skip
@@ -395,6 +395,22 @@ def test_scores_are_means_and_deviations_over_seeds() -> None:
     assert set(both["init"]) == {"random", "imagenet"}, "whose rows are not averaged"
     assert both["seeds"].tolist() == [1] * len(both) and both["spread"].isna().all()
     assert len(summarise_accuracy(first.iloc[:0])) == 0
+
+
+def test_accuracies_are_of_recorded_outcomes_where_they_are_known(
+    dots: Dataset, tmp_path: Path
+) -> None:
+    """A simulation of an official scene may end otherwise than its recording."""
+    index = dots.index[dots.index["scenario"] == "drop"].iloc[:3].copy()
+    index["contact"], index["recorded_contact"] = True, pd.array([False, None, True], "boolean")
+    decided = Decided(np.array([0.9, 0.9, 0.1]), 1.0)
+    part = ScenarioPredictions("drop", "observed", tuple(index["trial"]), decided, 0, -1, "")
+    table = make_table([part], Provenance("m", "none"), index)
+    assert table["test_accuracy"].unique() == pytest.approx([1 / 3])
+    write_table(table, tmp_path / "table.csv")
+    one = EvaluatedModel("m", "", 0, tmp_path / "table.csv", None, False, {})
+    assert list(one.accuracies().values()) == pytest.approx([1 / 3])
+    assert Evaluation([one], {}).scores["accuracy"].tolist() == pytest.approx([1 / 3])
 
 
 @pytest.mark.nightly

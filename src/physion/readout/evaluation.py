@@ -55,6 +55,7 @@ from physion.readout.tables import (
     make_table,
     read_table,
     summarise_accuracy,
+    true_outcomes,
     write_table,
 )
 from physion.trials.dataset import Dataset, JoinedDataset
@@ -101,9 +102,7 @@ class EvaluatedModel:
         The outcome is the recorded one, where it is known.
         """
         table = read_table(self.path)
-        known = table["recorded_outcome"].astype(str)
-        label = (known.where(known != "", table["outcome"].astype(str))) == "True"
-        right = table.assign(right=(table["p_contact"] > 0.5) == label)
+        right = table.assign(right=(table["p_contact"] > 0.5) == true_outcomes(table))
         keys = ["model", "init", "readout"]
         means = right.groupby([*keys, "scenario"])["right"].mean().groupby(keys).mean()
         return {
@@ -138,7 +137,10 @@ class Evaluation:
 
     @property
     def scores(self) -> pd.DataFrame:
-        """Accuracies, as mean and spread over seeds (`summarise_accuracy`)."""
+        """Accuracies, as mean and spread over seeds (`summarise_accuracy`).
+
+        The outcome is the recorded one, where it is known.
+        """
         return summarise_accuracy(self.predictions)
 
     @property

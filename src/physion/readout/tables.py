@@ -40,7 +40,8 @@ COLUMNS = (
   touched in the observed part already, empty if that is not known.
 - ``decision``: what turned features or rollouts into probabilities. ``readout_c``, ``noise_scale``
   and ``gap_threshold`` (metres): what it fitted.
-- ``train_accuracy``, ``test_accuracy``: means over all folds of a protocol, readout and scenario.
+- ``train_accuracy``, ``test_accuracy``: means over all folds of a protocol, readout and scenario;
+  tested by `true_outcomes`.
 - ``fit_labels``: outcomes that the decision was fitted on (`describe_labels`); ``fit_trials``:
   number of trials in the fit; ``fit_on``: set that they belong to, name and digest, empty for the
   dataset's own trials; ``fold``: fold of a cross-validation, or -1.
@@ -158,11 +159,18 @@ def make_table(
                 }
             )
     table = pd.DataFrame(rows, columns=list(COLUMNS))
-    hits = ((table["p_contact"] > 0.5) == table["outcome"]).astype(float)
+    hits = ((table["p_contact"] > 0.5) == true_outcomes(table)).astype(float)
     cells = [table[name] for name in ORDER[:-1]]
     table["test_accuracy"] = hits.groupby(cells).transform("mean")
     table["train_accuracy"] = table["train_accuracy"].astype(float).groupby(cells).transform("mean")
     return table.sort_values(list(ORDER), ignore_index=True)
+
+
+def true_outcomes(table: pd.DataFrame) -> pd.Series[bool]:
+    """Return the outcome of each prediction: the recorded one, where it is known."""
+    recorded = table["recorded_outcome"].astype(str)
+    known = recorded.isin(("True", "False"))
+    return recorded.where(known, table["outcome"].astype(str)) == "True"
 
 
 def write_table(table: pd.DataFrame, path: Path) -> None:
@@ -195,7 +203,7 @@ _GROUP = [*_MODEL, "scenario"]
 
 
 def summarise_accuracy(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the accuracy of predictions, as mean and spread over seeds.
+    """Return the accuracy of predictions by `true_outcomes`, as mean and spread over seeds.
 
     Parameters
     ----------
@@ -213,7 +221,7 @@ def summarise_accuracy(table: pd.DataFrame) -> pd.DataFrame:
     """
     if table.empty:
         return pd.DataFrame(columns=[*_GROUP, "seeds", "trials", "accuracy", "spread"])
-    hits = ((table["p_contact"] > 0.5) == table["outcome"]).astype(float)
+    hits = ((table["p_contact"] > 0.5) == true_outcomes(table)).astype(float)
     trained = table["dynamics_training_dataset"]
     protocol = table["protocol"].where(trained == "", table["protocol"] + ": " + trained)
     scored = table[[*_GROUP, "seed"]].assign(accuracy=hits, protocol=protocol)
