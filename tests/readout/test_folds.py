@@ -129,6 +129,32 @@ def test_each_protocol_trains_and_tests_what_the_paper_says(protocol: str, split
                 assert select_scenario(list(folds.values()), tested) == [fold]
 
 
+@pytest.mark.parametrize("split", ["training", "readout"])
+def test_scenarios_that_are_not_tested_train_too(split: str) -> None:
+    table = index({"training": 2, "readout": 2, "testing": 2}, ("drop", "link", "roll"))
+    table = table[(table["split"] != "testing") | (table["scenario"] == "drop")]
+    table = table[table["split"].isin((split, "readout", "testing"))]
+    expected = {
+        "all": {"all": ["drop", "link", "roll"]},
+        "all-but": {"no_drop": ["link", "roll"]},
+        "only": {"drop": ["drop"]},
+        "one": {"drop": ["drop"], "link": ["link"], "roll": ["roll"]},
+    }
+    for protocol, sets in expected.items():
+        for plan in (plan_folds, training_folds):
+            folds = plan(table, Protocol(protocol), 5, 0)
+            assert {f.training.name: list(f.training.trained) for f in folds} == sets
+            for fold in folds:
+                trained = [f"{s}_{split}_{i}" for s in sets[fold.training.name] for i in range(2)]
+                assert list(fold.train) == trained
+                assert [part.scenario for part in fold.scenarios] == ["drop"]
+    # Cross-validated, with a training split of other scenarios.
+    table = table[table["split"] != "readout"]
+    if split == "training":
+        trained = {tuple(f.train) for f in plan_folds(table, Protocol.ALL_BUT, 2, 0)}
+        assert trained == {tuple(f"{s}_training_{i}" for s in ("link", "roll") for i in range(2))}
+
+
 @pytest.mark.parametrize("protocol", ["all", "all-but", "only"])
 def test_a_cross_validation_trains_and_fits_on_all_other_groups(protocol: str) -> None:
     table = index({"testing": 6}, ("drop", "roll"))

@@ -7,7 +7,7 @@ on all.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
@@ -59,21 +59,26 @@ class TrainingSet:
     tested: tuple[str, ...]
 
 
-def training_sets(protocol: Protocol, scenarios: Sequence[str]) -> list[TrainingSet]:
-    """Return the trainings that a protocol needs: one in all, or one per scenario."""
-    names = tuple(sorted(set(scenarios)))
+def training_sets(
+    protocol: Protocol, tested: Sequence[str], others: Iterable[str] = ()
+) -> list[TrainingSet]:
+    """Return the trainings that a protocol needs: one in all, or one per scenario.
+
+    Scenarios that train are those ``tested``, and ``others`` that have trials to train on.
+    """
+    names, known = tuple(sorted(set(tested))), tuple(sorted({*tested, *others}))
     if not names:
         raise BadInputError("there is no scenario to train on")
     if protocol is Protocol.ALL:
-        return [TrainingSet("all", names, names)]
+        return [TrainingSet("all", known, names)]
     if protocol is Protocol.ONLY:
         return [TrainingSet(name, (name,), (name,)) for name in names]
     if protocol is Protocol.ONE:
-        return [TrainingSet(name, (name,), names) for name in names]
-    if len(names) < 2:
+        return [TrainingSet(name, (name,), names) for name in known]
+    if len(known) < 2:
         raise BadInputError(f"all-but needs two scenarios or more; there is only {names[0]!r}")
     return [
-        TrainingSet(f"no_{name}", tuple(n for n in names if n != name), (name,)) for name in names
+        TrainingSet(f"no_{name}", tuple(n for n in known if n != name), (name,)) for name in names
     ]
 
 
@@ -107,9 +112,9 @@ def plan_folds(index: pd.DataFrame, protocol: Protocol, folds: int, seed: int) -
     With the protocol *one* it is predicted once for each scenario that trains.
 
     Readouts are fitted on the readout split; dynamics are trained on the training split, or on
-    the readout split where there is none. If a scenario has no readout trial, the testing trials
-    are cross-validated instead: they are divided into ``folds`` groups, and each group is
-    predicted by what was fitted on the others.
+    the readout split where there is none, also on scenarios that are not tested. If a tested
+    scenario has no readout trial, the testing trials are cross-validated instead: they are divided
+    into ``folds`` groups, and each group is predicted by what was fitted on the others.
 
     Trials with the same physics (equal ``digest``) always share a group, and a readout or training
     trial with the physics of a testing trial is not used.
@@ -139,9 +144,9 @@ def plan_folds(index: pd.DataFrame, protocol: Protocol, folds: int, seed: int) -
     others = index[(index["split"] != TESTING) & ~index["digest"].isin(known)]
     fit = others[others["split"] == READOUT]
     train = others[others["split"] == TRAINING]
-    sets = training_sets(protocol, scenarios)
     if set(scenarios) <= set(fit["scenario"]):
         pool = train if len(train) else fit
+        sets = training_sets(protocol, scenarios, pool["scenario"])
         return [_make_fold(s, pool, fit, tested, -1) for s in sets]
     if folds < 2:
         raise BadInputError(f"a cross-validation needs at least 2 folds, not {folds}")
@@ -151,6 +156,7 @@ def plan_folds(index: pd.DataFrame, protocol: Protocol, folds: int, seed: int) -
         held = tested["trial"].map(numbers) == number
         rest = pd.concat([fit, tested[~held]])
         pool = train if len(train) else rest
+        sets = training_sets(protocol, scenarios, pool["scenario"])
         planned += [_make_fold(s, pool, rest, tested[held], number) for s in sets]
     return planned
 

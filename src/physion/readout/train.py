@@ -265,7 +265,8 @@ class _Train:
         index, settings = self.dataset.index, self.settings
         if settings.scenario and cell.protocol is Protocol.ALL:
             raise BadInputError("a scenario needs the protocol all-but, only or one")
-        # Both train on each scenario.
-        protocol = Protocol.ONLY if cell.protocol is Protocol.ONE else cell.protocol
+        # Of all that one trains, only the scenario itself is asked for.
+        one = cell.protocol is Protocol.ONE and settings.scenario
+        protocol = Protocol.ONLY if one else cell.protocol
         folds = training_folds(index, protocol, settings.folds, cell.seed)
         return select_scenario(folds, settings.scenario)
