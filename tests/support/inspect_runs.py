@@ -122,6 +122,9 @@ def main(dataset: str, folder: str) -> None:
     retried = eval_retry(log, log_dir=str(logs / "retried"), display="none")[0]
     kept = [sample for sample in retried.samples if sample.output.completion in ("A", "B")]
     found["retried"] = {"task": retried.eval.task, "kept": len(kept)}
+    asked = iter(range(100))
+    twice = run("twice", breaks, epochs=2, fail_on_error=False, max_connections=1, max_samples=1)
+    found["epochs"] = predictions(Path(twice.location))
     whole = next((logs / "yes").glob("*.eval"))
     found["read"] = predictions(whole)
     found["true"] = predictions(next((logs / "truth").glob("*.eval")))

@@ -109,6 +109,11 @@ def test_missing_answers_are_named_and_wrong_and_can_be_made(found: dict[str, An
     assert found["retried"] == {"task": "physion/contact", "kept": 4}
 
 
+def test_answers_that_fail_in_some_epochs_are_wrong(found: dict[str, Any]) -> None:
+    (warning,) = found["epochs"]["warnings"]
+    assert "12 of 16 answers are missing and count as wrong" in warning
+
+
 def test_other_logs_are_refused(found: dict[str, Any]) -> None:
     assert "asks about 'left'" in found["other question"]["error"]
     assert "cannot be read as a log of Inspect" in found["cut"]["error"]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,7 @@ from physion.trials.dataset import Dataset
 from physion.trials.share.items import Item, frames_of, items_of, movie_of
 from physion.trials.share.questions import (
     JudgedAnswer,
+    item_id,
     judged,
     measures,
     options_of,
@@ -244,6 +247,50 @@ def test_a_log_of_inspect_says_what_it_needs(tmp_path: Path) -> None:
     table.write_text('[{"stimulus": "a", "p_contact": 0.3}]')
     with pytest.raises(BadInputError, match="is not a log of Inspect; save predictions as a CSV"):
         read_answers(table)
+
+
+def log_of_inspect(
+    monkeypatch: pytest.MonkeyPatch, path: Path, answers: list[list[str | None]], status: str
+) -> Path:
+    """A log of both orders of one stimulus, asked twice; None for an answer that failed."""
+    asked = {item_id("a", "contact", order): ("a", "drop", "contact", "yes", order)
+             for order in (0, 1)}  # fmt: skip
+    samples = [
+        SimpleNamespace(id=name, error=None if text else "broken",
+                        output=SimpleNamespace(completion=text or ""))
+        for name, texts in zip(asked, answers, strict=True)
+        for text in texts
+    ]  # fmt: skip
+    facts = {"physion": 1, "media": "movie", "wording": 1, "asked": asked}
+    of_task = SimpleNamespace(
+        metadata=facts, model="m", dataset=SimpleNamespace(sample_ids=list(asked)),
+        config=SimpleNamespace(epochs=2),
+    )  # fmt: skip
+    log = SimpleNamespace(eval=of_task, status=status, samples=samples)
+    reader = SimpleNamespace(read_eval_log=lambda *_, **__: log)
+    monkeypatch.setitem(sys.modules, "inspect_ai", SimpleNamespace(log=reader))
+    monkeypatch.setitem(sys.modules, "inspect_ai.log", reader)
+    path.write_bytes(b"PK")
+    return path
+
+
+def test_an_answer_that_fails_in_one_epoch_is_wrong(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    path = log_of_inspect(monkeypatch, tmp_path / "log.eval", [["A", None], ["B", "B"]], "success")
+    log = read_answers(path)
+    assert log.predictions["p_contact"].tolist() == [3 / 4]
+    (warning,) = log.warnings
+    assert "1 of 4 answers are missing and count as wrong (a-contact-1)" in warning
+
+
+def test_a_run_that_did_not_succeed_is_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    path = log_of_inspect(monkeypatch, tmp_path / "log.eval", [["A", "A"], ["B", "B"]], "error")
+    log = read_answers(path)
+    assert log.predictions["p_contact"].tolist() == [1]
+    assert log.warnings == (f"{path}: its status is error: inspect eval-retry {path} completes it",)
 
 
 def test_the_first_option_of_a_control_is_named() -> None:

@@ -64,13 +64,14 @@ class AnswerLog:
 
 @dataclass
 class _Collected:
-    """Answers by item, with the model and what it was given."""
+    """Answers by item, with the model and what it was given; each is asked ``epochs`` times."""
 
     model: str
     inputs: str
     asked: Mapping[str, Asked]
     answers: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
     again: str = ""
+    epochs: int = 1
 
 
 def is_log(path: Path) -> bool:
@@ -126,8 +127,10 @@ def _inspect_log(path: Path) -> _Collected:
     movie = facts.get("media") == "movie"
     inputs = "observed movie" if movie else f"{facts.get('frames')} pictures"
     wording = "" if facts.get("wording") == 1 else f", wording {facts.get('wording')}"
-    again = "" if log.status == "success" else f"inspect eval-retry {path} completes it"
-    found = _Collected(str(log.eval.model), inputs + wording, asked, again=again)
+    again = f"its status is {log.status}: inspect eval-retry {path} completes it"
+    again = "" if log.status == "success" else again
+    epochs = log.eval.config.epochs or 1
+    found = _Collected(str(log.eval.model), inputs + wording, asked, again=again, epochs=epochs)
     for sample in log.samples or []:
         if sample.id in asked and sample.error is None:
             found.answers[str(sample.id)].append(str(sample.output.completion))
@@ -180,19 +183,23 @@ def _predictions(path: Path, log: _Collected) -> AnswerLog:
     missing, unreadable = [], 0
     for name, asked in sorted(log.asked.items()):
         options = options_of(asked.question, asked.order)
-        texts = log.answers.get(name, [])
-        missing += [] if texts else [name]
-        answers = [read_answer(text, options) for text in texts] or [""]
-        unreadable += sum(not answer for answer in answers) - (not texts)
-        by_trial[asked.trial] += [(asked, answer) for answer in answers]
+        answers = [read_answer(text, options) for text in log.answers.get(name, [])]
+        unreadable += answers.count("")
+        lacking = max(log.epochs - len(answers), 0)
+        missing += [name] * lacking
+        by_trial[asked.trial] += [(asked, answer) for answer in [*answers, *[""] * lacking]]
     warnings = []
+    again = [log.again] if log.again else []
     if missing:
-        names = ", ".join(missing[:_NAMED]) + (", ..." if len(missing) > _NAMED else "")
-        again = f"; {log.again}" if log.again else ""
-        warnings.append(
-            f"{path}: {len(missing)} of {len(log.asked)} answers are missing and count as wrong "
-            f"({names}){again}"
+        named = list(dict.fromkeys(missing))
+        names = ", ".join(named[:_NAMED]) + (", ..." if len(named) > _NAMED else "")
+        lost = (
+            f"{len(missing)} of {len(log.asked) * log.epochs} answers are missing and count as "
+            f"wrong ({names})"
         )
+        again = [lost, *again]
+    if again:
+        warnings.append(f"{path}: {'; '.join(again)}")
     if unreadable:
         warnings.append(f"{path}: {unreadable} answers name no option and count as wrong")
     rows = [_row(trial, answers) for trial, answers in sorted(by_trial.items())]
