@@ -69,7 +69,8 @@ class HubSettings(ModelSettings):
     - ``stride``: frames of the motion between two frames; None: 6, or of a video encoder as many as
       let a clip fill the observed part. ``future``: see `Spec`.
     - ``layer``: block of a transformer, counted from 1, whose output the features are; None is the
-      last, after its norm. Networks whose blocks are divided into stages have no such option.
+      ``last_hidden_state`` of transformers: of the last block, after its norm, but of CLIP before
+      it. Networks whose blocks are divided into stages have no such option.
     - ``pooling``: ``pooled`` (the class token of an image encoder that has one, else the mean),
       ``mean`` of the tokens of patches, ``grid``, means in cells, or ``attentive``, means in cells
       that the decision of this name reads.
