@@ -217,7 +217,7 @@ def _of_model(
 
 
 def _facts(dataset: Dataset, names: Iterable[str], rendered: bool) -> list[Any]:
-    """Return what a surprise depends on, beside the model."""
+    """Return what a surprise depends on, apart from the model."""
     files = dataset.index.set_index("trial")[_HASHED_COLUMNS]
     of_files = [[name, *map(str, files.loc[name])] for name in sorted(names)]
     return [_VERSION, __version__, rendered, *of_files]
