@@ -96,6 +96,7 @@ class Shelf:
                         "movie_sha256": "", "observed_movie_sha256": "",
                         "frames": FRAMES, "playback_seconds": FRAMES / 30, "observed_frames": 45,
                         "observed_contact": False, "look": "redyellow", "engine": "flight",
+                        "trial_file_sha256": name,
                     }
                 )  # fmt: skip
         self.index = pd.DataFrame(rows)
@@ -182,7 +183,10 @@ def test_predictions_count_futures_and_state_their_scale(tmp_path: Path) -> None
     counts = table["p_contact"].to_numpy() * 21 - 0.5
     assert np.allclose(counts, counts.round()) and (counts.round() % 20 != 0).sum() > 0
     assert (table["noise_scale"] == 1.0).all() and set(table["readout"]) == {"observed+simulated"}
-    assert table["test_accuracy"].iloc[0] > 0.7
+    said = table["p_contact"] > 0.5
+    assert (said == table["outcome"]).mean() > 0.7
+    recorded = table["recorded_outcome"] == "True"  # of every second trial here
+    assert (table["test_accuracy"] == (said == recorded).mean()).all()
     assert set(table["recorded_outcome"]) == {"True", "False"}
     assert (table["init"] == "none").all()
 
