@@ -117,14 +117,16 @@ def test_movies_are_judged_and_bad_ones_named(
     assert again.complete and again.seeds["right"][0] == 1 and one.stat().st_mtime_ns == made
 
 
+@pytest.mark.parametrize("known", [True, pd.NA])
 def test_trials_with_a_contact_in_the_observed_part_do_not_count(
-    dataset: Dataset, generated: Path, tmp_path: Path
+    known: Any, dataset: Dataset, generated: Path, tmp_path: Path
 ) -> None:
     """What is seen in Collide would be wrong: the answer was shown."""
     folder = tmp_path / "trials"
     shutil.copytree(dataset.folder, folder)
-    touched = dataset.index.assign(observed_contact=dataset.index["scenario"] == "collide")
-    write_index(folder, touched)
+    observed = pd.array([False] * len(dataset.index), "boolean")
+    observed[(dataset.index["scenario"] == "collide").to_numpy()] = known
+    write_index(folder, dataset.index.assign(observed_contact=observed))
     done = judge(generated, folder, tmp_path / "out", executor=SerialExecutor())
     assert (done.seeds.set_index("seed")["right"] == 0).all(), "movies of Drop are missing"
     assert done.movies.groupby("scenario")["observed_contact"].all().to_dict() == {
@@ -133,7 +135,7 @@ def test_trials_with_a_contact_in_the_observed_part_do_not_count(
     predictions = pd.read_csv(done.paths["predictions"])
     assert list(predictions["stimulus"]) == dataset.trials(scenario="drop")
     (line,) = done.warnings
-    assert line.startswith("1 trial with a contact in the observed part: left out")
+    assert line.startswith("1 trial with a contact in the observed part, or where that")
     with pytest.raises(BadInputError, match="observed part of every chosen trial"):
         judge(generated, folder, tmp_path / "out", scenario="collide")
 

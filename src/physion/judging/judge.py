@@ -100,10 +100,10 @@ def judge(
     card = _card(folder)
     trials = [item.trial for item in items_of(known, split=split, scenario=scenario)[::2]]
     rows = known.index.set_index("trial").loc[trials]
-    if rows["observed_contact"].all():
+    if rows["observed_contact"].fillna(True).all():
         raise BadInputError(
-            f"agent and patient touch in the observed part of every chosen trial of {dataset}: "
-            "nothing is left to predict; take others"
+            f"agent and patient touch in the observed part of every chosen trial of {dataset}, or "
+            "that is not known: nothing is left to predict; take others"
         )
     status, digests = _what_is_there(folder, card, trials)
     jobs = {}
@@ -280,7 +280,7 @@ def _collect(
                 "status": found.get("status", failed.get(trial, why)) if why == JUDGED else why,
                 "true_contact": bool(facts.loc[trial, "contact"]),
                 "true_frame": facts.loc[trial, "first_frame"],
-                "observed_contact": bool(facts.loc[trial, "observed_contact"]),
+                "observed_contact": bool(facts["observed_contact"].fillna(True)[trial]),
             }
             rows.append(row | dict.fromkeys(COLUMNS) | found.get("measures", {}))
             if "tracks" in found:

@@ -65,7 +65,8 @@ class Judged:
     - ``card``: what the user says of the movies.
     - ``movies``: one row per trial and seed: ``trial``, ``scenario``, ``seed``, ``status``
       (*judged*, or why not), ``true_contact``, ``true_frame``, ``observed_contact`` (whether they
-      truly touch in the observed part already), and the measures of `COLUMNS`.
+      truly touch in the observed part already; also if that is not known), and the measures of
+      `COLUMNS`.
     - ``seeds``: one row per seed, then *mean* and *sd* over them: ``movies``, ``right`` (fraction
       of all movies asked for that show the true outcome; missing ones do not; without trials with
       ``observed_contact``), and the means of all measures.
@@ -127,8 +128,8 @@ class Judged:
         left = self.movies["trial"][self.movies["observed_contact"]].nunique()
         if left:
             found.append(
-                f"{plural(left, 'trial')} with a contact in the observed part: left out of right "
-                "and of the comparison"
+                f"{plural(left, 'trial')} with a contact in the observed part, or where that is "
+                "not known: left out of right and of the comparison"
             )
         return found
 
